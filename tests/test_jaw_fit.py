@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gripmon.teach.finger_depth import Outline
 from gripmon.teach.image_motion import Unfit
 from gripmon.teach.jaw_fit import _best_of, _Solved
 from gripmon.teach.jaw_unknowns import _shown
+from gripmon.teach.vanishing import Outline
 
 NONE = np.zeros(0)
 

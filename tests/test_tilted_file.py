@@ -20,8 +20,9 @@ from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, Bump, FingerLook
-from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, Outline, place
+from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, place
 from gripmon.teach.result import GripperResult
+from gripmon.teach.vanishing import Outline
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.track.integrity import Separation
 

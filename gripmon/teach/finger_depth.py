@@ -15,11 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.model.records import Array
 from gripmon.teach.straight_pieces import LONGEST_CUT_PX
-from gripmon.teach.vanishing import PARALLEL_RAD, finger_direction, missed_rad, sight_of, tip_centre
+from gripmon.teach.vanishing import PARALLEL_RAD, Outline, finger_direction, missed_rad, sight_of, tip_centre
 
 LEAST_PLANE_COSINE = 0.25
 """Cosine between line of sight and fingers below which the contact plane is too oblique to place corners on it."""
@@ -34,23 +33,6 @@ USUAL_TILT_SIGMA_RAD = math.radians(15.0)
 """Its standard deviation, and that of the plane's tilt to either side."""
 FLAT_SIGMA_RAD = math.radians(26.0)
 """Standard deviation of the tilt of a plane where it isn't known: anything up to 45 degrees (45 / sqrt(3))."""
-
-
-@dataclass(frozen=True)
-class Outline:
-    """A finger's outline: ``xy`` (v, 2) of its vertices in ideal coordinates, ``corner`` (v,), ``pieces`` as pairs of
-    vertices, ``outwards`` (2,), the direction to its tip in the image, ``length_px`` (p,) of the pieces; ends
-    ``inner_xy`` (i, 2, 2) and lengths ``inner_px`` (i,) of its inner edges.
-    """
-
-    name: str
-    xy: Array
-    corner: NDArray[np.bool_]
-    pieces: tuple[tuple[int, int], ...]
-    outwards: Array
-    length_px: Array
-    inner_xy: Array
-    inner_px: Array
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from gripmon.model.gripper import EdgeModel, FingerModel, GripperModel, JawModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 from gripmon.teach.curved_edges import smooth_curve
-from gripmon.teach.finger_depth import Outline, PlacedOutlines, leaves_smoothly, nearest_on_ray
+from gripmon.teach.finger_depth import PlacedOutlines, leaves_smoothly, nearest_on_ray
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
-from gripmon.teach.vanishing import PARALLEL_RAD
+from gripmon.teach.vanishing import PARALLEL_RAD, Outline
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
 SHORTEST_EDGE_PX = 4.0

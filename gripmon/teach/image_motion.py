@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import Outline
 from gripmon.teach.image_outline import OpeningSeen
-from gripmon.teach.vanishing import ALONG_RAD
+from gripmon.teach.vanishing import ALONG_RAD, Outline
 
 SAME_OPENING_M = 5e-5
 """Openings closer than this count as one: about 0.2 px of each finger, 100 mm away."""

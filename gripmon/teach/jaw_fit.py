@@ -27,12 +27,13 @@ from scipy.optimize import least_squares
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import Outline, PlacedOutlines
+from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_unknowns import STATIONS, Jaws
 from gripmon.teach.silhouette import FROM_BORDER_PX, Stations, in_image, lines_in_image, measure_transitions
 from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, LONGEST_CUT_PX, STRAIGHT_PX
+from gripmon.teach.vanishing import Outline
 
 MORE_CHI2 = 9.0
 """Least decrease of the fit's chi-squared by which tips move on arcs, or fingers turn: three standard deviations."""

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import Outline, PlacedOutlines
+from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.image_motion import TIP_SHARE, Unfit, along_finger, contact, rough_shift_px
 from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.vanishing import Outline
 
 LARGEST_COMMON_MOTION = 0.2
 """Largest common motion along the jaws' travel, over the relative one: 0.5 if one jaw is fixed, a few hundredths for

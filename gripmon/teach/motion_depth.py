@@ -13,10 +13,11 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
-from gripmon.teach.finger_depth import FLAT_SIGMA_RAD, Outline, PlacedOutlines
+from gripmon.teach.finger_depth import FLAT_SIGMA_RAD, PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_fit import fit_motion
+from gripmon.teach.vanishing import Outline
 
 MOST_TOGETHER = 0.55
 """Largest mean motion of the fingers over their relative motion: with one fixed jaw it is 0.5, known to a tenth."""

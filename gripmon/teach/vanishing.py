@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-
-if TYPE_CHECKING:
-    from gripmon.teach.finger_depth import Outline
 
 LONG_PX = 30.0
 """Least length of an edge that shows a direction: 0.1 px at each end is 0.3 degrees."""
@@ -24,6 +21,23 @@ PARALLEL_LENGTH_SHARE = 0.5
 their ends."""
 ALONG_RAD = math.radians(50.0)
 """Largest angle between the image of an edge along a finger and the direction to its tip: perspective turns it."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A finger's outline: ``xy`` (v, 2) of its vertices in ideal coordinates, ``corner`` (v,), ``pieces`` as pairs of
+    vertices, ``outwards`` (2,), the direction to its tip in the image, ``length_px`` (p,) of the pieces; ends
+    ``inner_xy`` (i, 2, 2) and lengths ``inner_px`` (i,) of its inner edges.
+    """
+
+    name: str
+    xy: Array
+    corner: NDArray[np.bool_]
+    pieces: tuple[tuple[int, int], ...]
+    outwards: Array
+    length_px: Array
+    inner_xy: Array
+    inner_px: Array
 
 
 def finger_direction(fingers: Sequence[Outline]) -> tuple[Array | None, float]:

@@ -116,9 +116,7 @@ class SinceReference(msgspec.Struct, frozen=True, gc=False):
     ]
     since_ns: Annotated[
         int,
-        Meta(
-            description="stamp of the newest of those frames, or of the middle one of the first proved ones, Unix ns"
-        ),
+        Meta(description="stamp of the newest of those frames, or of the middle one of the first proved ones, Unix ns"),
     ]
 
 
