@@ -41,7 +41,7 @@ class PlacedOutlines:
     unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
     to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws;
-    ``tcp_covariance`` (3, 3) then; ``assumed``: nothing tells the tilt of their plane.
+    ``tcp_covariance`` (3, 3) and ``slope_sigma`` (2,) of their plane then; ``assumed``: nothing tells its tilt.
     """
 
     points: tuple[Array, ...]
@@ -55,10 +55,13 @@ class PlacedOutlines:
     normal: Array | None = None
     tcp_covariance: Array | None = None
     assumed: bool = False
+    slope_sigma: Array | None = None
 
     @property
     def tilt_sigma_rad(self) -> float:
         """Standard deviation of the tilt of the points' plane, as a gripper file has it."""
+        if self.slope_sigma is not None:  # how a taper's sides spread about z is no error of their depths
+            return float(self.slope_sigma.max())
         return USUAL_TILT_SIGMA_RAD if self.assumed else float(self.sigma_rad.max())
 
 

@@ -302,7 +302,8 @@ def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str
         notes.append(
             "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: no three "
             "long edges of the fingers meet in one point. The tilt's standard deviation of 15 degrees is in the bounds "
-            "of motions and of the absolute rotation (tilt_sigma_rad in the gripper file)"
+            "of motions and of the absolute rotation (tilt_sigma_rad in the gripper file), by which no transform is "
+            "valid then: configure monitor.policy.valid_by: reference"
         )
     elif placed.flat:
         notes.append("the outline is assumed to lie in the reference's plane of x and z: its own edges show no other")

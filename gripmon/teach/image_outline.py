@@ -57,7 +57,7 @@ class OpeningSeen:
     left_out: dict[int, str]
     blur_px: float
     rest: Bits
-    borders: tuple[Border, ...]
+    borders: tuple[Border, ...] = ()
 
 
 def see_opening(

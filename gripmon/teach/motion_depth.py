@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,6 +96,8 @@ def _move(
             return placed, Moved({}, None, found.turned)
         if found.by_motion:
             placed, found = place_by_motion(fingers, found, pose, absolute=travel is not None)
+        elif pose is None:
+            placed = _across_travel(placed, found.direction)
         return placed, Moved(found.moved, found)
     except Unfit as unfit:
         if unfit.opening is not None:
@@ -107,6 +109,14 @@ def _move(
     if placed.flat or len(fingers) == 1:
         return placed, Moved(found.moved, None, why)
     return placed, Moved(found.moved, found)
+
+
+def _across_travel(placed: PlacedOutlines, direction: Array) -> PlacedOutlines:
+    """With x as the jaws move, square to the fingers: which of the tips' vertices face each other tells less."""
+    along = placed.rotation[:, 2]
+    across = direction - along * float(along @ direction)
+    across *= np.sign(float(across @ placed.rotation[:, 0])) / np.linalg.norm(across)
+    return replace(placed, rotation=np.column_stack([across, np.cross(along, across), along]))
 
 
 def place_by_motion(
@@ -144,4 +154,6 @@ def place_by_motion(
     sigma = np.hypot(sigma, 0.5 * float(np.mean(spreads)))
     made = tuple(points), found.kept, rotation, tcp, False, sigma
     found = found.over(depth)
-    return PlacedOutlines(*made, by_motion=True, tcp_covariance=found.tcp_covariance), found
+    return PlacedOutlines(
+        *made, by_motion=True, tcp_covariance=found.tcp_covariance, slope_sigma=found.slope_sigma
+    ), found

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import NormalDist
 
 import msgspec
 
@@ -20,7 +21,7 @@ from gripmon.io.sources import FolderSettings, SourceError
 from gripmon.io.sources.files import opening_beside
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
-from gripmon.model.gripper import SIZE_UNKNOWN
+from gripmon.model.gripper import SIZE_UNKNOWN, Gripper
 from gripmon.model.records import ReferenceRecord, ValidBy
 from gripmon.model.yaml_text import yaml_value
 from gripmon.monitor import MonitorSettings
@@ -65,7 +66,7 @@ def config_text(
         parts.append(lines_of(source, 2))
     if inputs.setup.gripper.has_jaw:
         parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
-    parts += ["", _defaults(inputs.setup.settings, inputs.setup.gripper.model.scale_sigma < SIZE_UNKNOWN)]
+    parts += ["", _defaults(inputs.setup.settings, inputs.setup.gripper)]
     return "\n".join(parts) + "\n"
 
 
@@ -148,12 +149,15 @@ def _in_table(inputs: Inputs) -> bool:
         return False
 
 
-def _defaults(monitor: MonitorSettings, size_known: bool) -> str:
+def _defaults(monitor: MonitorSettings, gripper: Gripper) -> str:
     """The defaults, commented out but for the response of the camera as it was found, and for what a transform of a
-    gripper of unknown size is valid by: its motion since the reference, in units of its distance.
+    gripper of unknown size or tilt is valid by: its motion since the reference.
     """
-    if not size_known:
-        policy = msgspec.structs.replace(monitor.policy, valid_by=ValidBy.REFERENCE)
+    model, policy = gripper.model, monitor.policy
+    tilt_rad = NormalDist().inv_cdf(1.0 - policy.integrity_risk / 4.0) * model.tilt_sigma_rad  # its part of a bound
+    absolute = model.scale_sigma < SIZE_UNKNOWN and tilt_rad < policy.alert_limit_rad
+    if not absolute:
+        policy = msgspec.structs.replace(policy, valid_by=ValidBy.REFERENCE)
         monitor = msgspec.structs.replace(monitor, policy=policy)
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
@@ -164,7 +168,7 @@ def _defaults(monitor: MonitorSettings, size_known: bool) -> str:
             section = [f"# {field.name}:", *lines_of(value, 2, off=True).splitlines()]
             if value is monitor:
                 section = _on(section, "corners", "edges", "response")
-                section = section if size_known else _on(section, "policy", "valid_by")
+                section = section if absolute else _on(section, "policy", "valid_by")
             lines += section
     return "\n".join(lines)
 
