@@ -229,7 +229,8 @@ def _fingers(
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
         along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
-        for run, closed in runs(found.usable, points):
+        # What doesn't show in enough images is left out piece by piece, or bridged: a run goes on across it.
+        for run, closed in runs(found.shown, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
                 camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px

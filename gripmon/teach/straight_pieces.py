@@ -215,8 +215,8 @@ def fit_chains(
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
         return all(
             float(np.linalg.norm(meet - end)) < LONGEST_CUT_PX
-            and _goes_on(camera, images, noise, end, meet, outward[[at]], blur_px)
-            for end, at in zip(ends, (before[0][1], after[0][0]), strict=True)
+            and _goes_on(camera, images, noise, end, meet, outward[[(first + last) // 2]], blur_px, WORST_SIGMA_PX)
+            for end, ((first, last), _) in zip(ends, (before, after), strict=True)
         )
 
     out = []
@@ -284,7 +284,14 @@ def _without_rounding(
 
 
 def _goes_on(
-    camera: Camera, images: NDArray[np.float32], noise: float, start: Array, meet: Array, outward: Array, blur_px: float
+    camera: Camera,
+    images: NDArray[np.float32],
+    noise: float,
+    start: Array,
+    meet: Array,
+    outward: Array,
+    blur_px: float,
+    within_px: float = STRAIGHT_PX + LEAST_SCATTER_PX,
 ) -> bool:
     """Whether an edge follows its line from its end to a corner, ideal pixels."""
     length = float(np.linalg.norm(meet - start))
@@ -296,7 +303,7 @@ def _goes_on(
         return False
     found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
     off = np.abs(found.offset_px[found.usable])
-    return bool(len(off) and float(np.quantile(off, 0.9)) < STRAIGHT_PX + LEAST_SCATTER_PX)
+    return bool(len(off) and float(np.quantile(off, 0.9)) < within_px)
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
