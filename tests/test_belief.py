@@ -245,11 +245,29 @@ def test_what_nothing_explains_gives_no_bound() -> None:
         if 4 <= t < 6:
             frame.seen.measured[:] += np.random.default_rng(t).normal(0.0, 5.0, (8, 2))
         believed = belief.update(frame.seen, DT_S)
-        if t < 4:
-            assert believed.known and believed.bound.position_m < 1e-3
         if t in (4, 5):
             assert not believed.known
             assert believed.bound.position_m == believed.bound.absolute_rad == np.inf
+        else:  # nothing was learnt from what nothing explains
+            assert believed.known
+            assert np.linalg.norm(believed.motion[:3]) < believed.bound.position_m < 1e-3
+
+
+@pytest.mark.parametrize("pause_s", [2.0, 8.0, 600.0])
+def test_frames_after_a_pause_are_bounded(pause_s: float) -> None:
+    """What happened meanwhile is as probable as the rates say; the bound is true, and soon as small as before."""
+    from benchmarks.belief_world import World
+
+    world = World(np.random.default_rng(3), Priors(), 60)
+    belief = Belief(world.view.doubts, world.view.axis, risk=1e-4)
+    for t in range(60):
+        sample = world.frame()
+        dt_s = pause_s if t == 30 else DT_S
+        believed = belief.update(sample.seen, dt_s, sample.told, light_memory=sample.light_memory)
+        assert np.linalg.norm((believed.motion - sample.motion)[:3]) <= believed.bound.position_m
+    assert believed.bound.position_m < 2e-4
+    with pytest.raises(ValueError, match="dt_s"):
+        belief.update(sample.seen, 0.0, sample.told)
 
 
 @pytest.mark.slow("60 s; test_all_sets_weigh_what_the_sum_over_all_paths_says, and the sampled runs beside it")

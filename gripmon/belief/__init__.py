@@ -1,1 +1,1 @@
-"""Where the gripper stands and what may be wrong, as probabilities (``docs/integrity.md``)."""
+"""Where the gripper stands and what may be wrong, as probabilities."""

@@ -18,11 +18,12 @@ from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_
 from gripmon.belief.keep import keep, remember
 from gripmon.belief.nodes import Nodes, prepare
 from gripmon.belief.rows import add_noise, fade, move
-from gripmon.belief.search import Asked, Candidates, put, put_all, put_pairs, search
+from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search
 from gripmon.belief.state import (
     LATELY_S,
     LEAST_LIGHT_MEMORY,
     LIGHT,
+    MOST_LAG,
     MOTION,
     OPENING,
     REFERENCE,
@@ -34,8 +35,8 @@ from gripmon.belief.state import (
 )
 from gripmon.model.records import Array
 
-GUARD = 30.0
-"""Surprise (a logarithm) of the best hypothesis beyond which no hypothesis is believed: e^-30 is none of the risks."""
+GUARD = 20.0
+"""No hypothesis is believed beyond a surprise that the right one exceeds with at most e^-20 (once a year at 15/s)."""
 NOT_KNOWN_WEIGHT = 0.1
 """Of the hypothesis that the pose isn't known, while the guard stops: policy."""
 _MOST_CANDIDATES = 4096
@@ -67,11 +68,12 @@ class Believed(NamedTuple):
 
 
 class Jumps(NamedTuple):
-    """What moves at once: log share and rate per second ``log_rate`` (j,), with ``factors`` (j, 6, 23) of its
-    covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): the rate is that of knocks, ``log_rate`` its share.
+    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), with ``factors`` (j, 6, 23) of its
+    covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): it is one.
     """
 
-    log_rate: Array
+    share: Array
+    per_s: Array
     factors: Array
     ranks: Ints
     knock: Array
@@ -79,27 +81,33 @@ class Jumps(NamedTuple):
     @classmethod
     def of(cls, priors: Priors, along: Array) -> Jumps:
         """``along`` (3,): the fingers' direction in camera axes."""
-        logs, factors, knock = [], [], []
+        shares, rates, factors, knock = [], [], [], []
 
-        def put(share: float, rows: Array, is_knock: bool) -> None:
-            logs.append(math.log(share))
+        def put(share: float, rate: float, rows: Array, is_knock: bool) -> None:
+            shares.append(share)
+            rates.append(rate)
             factors.append(rows)
             knock.append(is_knock)
 
-        put(priors.small_per_s, _diagonal([priors.small_m] * 3 + [priors.small_rad] * 3), False)
+        put(1.0, priors.small_per_s, _diagonal([priors.small_m] * 3 + [priors.small_rad] * 3), False)
         for size_m, share in priors.any_way:
-            put(share * (1.0 - priors.along_share), _diagonal([size_m] * 3 + [priors.knock_rad] * 3), True)
+            put(
+                share * (1.0 - priors.along_share),
+                priors.knock_per_s,
+                _diagonal([size_m] * 3 + [priors.knock_rad] * 3),
+                True,
+            )
         for size_m, share in priors.along:
             row = np.zeros((1, SIZE))
             row[0, :3] = size_m * along
-            put(share * priors.along_share, row, True)
+            put(share * priors.along_share, priors.knock_per_s, row, True)
         row = np.zeros((1, SIZE))
         row[0, OPENING] = priors.opening_jump_m
-        put(priors.opening_per_s, row, False)
+        put(1.0, priors.opening_per_s, row, False)
         padded = np.zeros((len(factors), 6, SIZE))
         for j, rows in enumerate(factors):
             padded[j, : len(rows)] = rows
-        return cls(np.array(logs), padded, np.array([len(f) for f in factors]), np.array(knock))
+        return cls(np.array(shares), np.array(rates), padded, np.array([len(f) for f in factors]), np.array(knock))
 
 
 class Belief:
@@ -123,7 +131,7 @@ class Belief:
         self._everything, self._searching = everything, searching
         kept = _MOST_CANDIDATES if everything else most + 1
         self._bank, self._other = (Bank.empty(kept, self._edges, backgrounds) for _ in range(2))
-        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.log_rate)), self._edges)
+        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges)
         self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
         self._bank.covariance[0] = self.priors.covariance()
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
@@ -154,9 +162,12 @@ class Belief:
     ) -> Believed:
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
         0. ``hidden_knock``: probability of a knock that is due in this frame because no end is shown (policy; once for
-        each such stretch), beside that of the rate; hypotheses that doubt all ends have it in any case.
+        each such stretch), beside that of the rate; hypotheses that begin to
+        doubt all ends have it in any case.  Raises ValueError unless time goes on.
         """
         first = self._first
+        if not dt_s > 0.0:
+            raise ValueError(f"dt_s = {dt_s}: frames follow each other in time")
         if not first:
             self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY))
         for h in range(self._hypotheses):
@@ -165,10 +176,15 @@ class Belief:
         asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first)
         n = self._branch(asked, dt_s, hidden_knock)
         surprise = float(self._candidates.surprise[int(np.argmax(self._candidates.log_weight[:n]))])
-        dropped = self._keep(n, asked)
-        self._first, self._lost = False, surprise > GUARD
-        if self._lost:
-            self._not_known()
+        # A bound on the tail of chi-squared (Laurent and Massart 2000, lemma 1).
+        usual = math.sqrt(2.0 * GUARD * int(seen.shown.sum())) + GUARD
+        was_lost, self._lost, self._first = self._lost, not surprise <= usual, False
+        if not self._lost:
+            dropped = self._keep(n, asked)
+        else:  # nothing is learnt from what nothing explains
+            dropped = 0.0
+            if not was_lost:
+                self._not_known()
         return self._believed(dropped, surprise)
 
     def _predict(self, dt_s: float, light: float) -> None:
@@ -177,7 +193,7 @@ class Belief:
         rows[range(6), range(6)] = np.repeat([priors.creep_m_s * root_dt, priors.creep_rad_s * root_dt], 3)
         rows[6, LIGHT] = priors.light_px * math.sqrt(1.0 - light * light)
         factor = rows if light < 1.0 else rows[:6]
-        lag = 1.0 - math.exp(-dt_s / LATELY_S)
+        lag = min(1.0 - math.exp(-dt_s / LATELY_S), MOST_LAG)
         for h in range(self._hypotheses):
             move(self._bank, h, lag, light)
             if factor.any():
@@ -194,13 +210,14 @@ class Belief:
                 n = put_all(candidates, n, nodes, h, bank, asked)
             else:
                 n = put(candidates, n, nodes, h, int(bank.doubts[h]), bank, asked)
-                if asked.first or self._lost:
-                    n = put_pairs(candidates, n, nodes, h, bank, asked)
         if self._everything:
             return n
         least = -math.log(self.least)
         if not asked.first:
             n = self._jump(n, asked, dt_s, hidden_knock, least)
+        if asked.first or self._lost:
+            for h in np.argsort(-bank.log_weight[: self._hypotheses])[:AT_ONCE]:
+                n = put_pairs(candidates, n, nodes, int(h), bank, asked)
         reach = -math.log(0.3 * self.risk)
         return int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
 
@@ -212,11 +229,12 @@ class Belief:
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0)
-            rate = self.priors.knock_per_s * dt_s + hidden_knock
-            if self._began[h]:
-                rate += self.priors.unseen_knock
-            for j, log_rate in enumerate(jumps.log_rate):
-                log = float(log_rate) + math.log(rate if jumps.knock[j] else dt_s)
+            due = hidden_knock + (self.priors.unseen_knock if self._began[h] else 0.0)
+            for j in range(len(jumps.share)):
+                chance = 1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
+                if chance <= 0.0:
+                    continue
+                log = math.log(jumps.share[j] * chance)
                 if stayed[h] + hope + log < best - least:
                     continue
                 factor = jumps.factors[j, : jumps.ranks[j]]

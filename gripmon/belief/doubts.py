@@ -143,8 +143,10 @@ class Onsets:
         if first:
             self._waits += np.log1p(-rates[0])
         else:
-            self._waits += np.log1p(-rates[2] * new) - rates[1] * dt_s
-            self._leaves += np.log1p(-rates[4] * new) - rates[3] * dt_s
+            both = rates[1] + rates[3]
+            turned = -np.expm1(-both * dt_s) / np.maximum(both, 1e-300)  # a chain of two states, in any time
+            self._waits += np.log1p(-rates[2] * new) + np.log1p(-rates[1] * turned)
+            self._leaves += np.log1p(-rates[4] * new) + np.log1p(-rates[3] * turned)
         begins = np.where(silent, 0.0, -np.expm1(self._waits))
         ends = np.where(silent, 0.0, -np.expm1(self._leaves))
         self._waits[~silent], self._leaves[~silent], self._first = 0.0, 0.0, False

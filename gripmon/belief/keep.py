@@ -20,7 +20,7 @@ def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: A
     """``mean`` (23,), which is that before the frame, and ``covariance`` (23, 23) of g after it."""
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     weigh(nodes, i, seen, doubted, held, root, solution)
-    half = np.empty((SIZE, SIZE))  # row j: root of M^-1 L', so that the covariance is half' half
+    half = np.empty((SIZE, SIZE))  # row j: root of M^-1 L', so that the covariance is half half'
     for j in range(SIZE):
         for k in range(SIZE):
             half[j, k] = nodes.root[i, j, k]

@@ -40,16 +40,19 @@ FOCAL = 22
 NEAR, FAR = 0, 1
 FOREIGN_KINDS = 2
 STILL = 0.99
-"""Likeness of two pictures from which on the background counts as the same one (``docs/integrity.md``)."""
+"""Likeness of two pictures from which on the background counts as the same one."""
 LATELY_S = 0.19
 """Time constant of p: 0.3 of the way in a frame at 15 frames/s."""
+MOST_LAG = 0.99
+"""Of the way to d in one frame, however long ago the last one was: what is nearer has no transition that can be undone.
+"""
 LEAST_LIGHT_MEMORY = 0.01
 """What is left of a light that is renewed: none would make its transition singular."""
 
 
 @dataclass(frozen=True)
 class Priors:
-    """Standard deviations, and rates per second, fixed before any benchmark; see ``docs/integrity.md``.
+    """Standard deviations, and rates per second, fixed before any benchmark.
 
     Of the reference's error b (6,), m and rad; of the jaw opening and the finger lengths, m; of the light, px; of the
     focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is

@@ -215,7 +215,7 @@ def fit_chains(
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
         return all(
             float(np.linalg.norm(meet - end)) < LONGEST_CUT_PX
-            and _goes_on(camera, images, noise, end, meet, outward[[(first + last) // 2]], blur_px, WORST_SIGMA_PX)
+            and _goes_on(camera, images, noise, end, meet, outward[[(first + last) // 2]], blur_px, WORST_RMS_PX)
             for end, ((first, last), _) in zip(ends, (before, after), strict=True)
         )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from gripmon.belief.doubts import Doubt
 from gripmon.belief.state import Array, Priors, Seen
@@ -68,8 +69,10 @@ def _chains(doubts: Sequence[Doubt], frames: Sequence[Told], dt_s: float, path: 
         for t, frame in enumerate(frames):
             new = 0.0 if d.held else 1.0 - float(frame.seen.likeness[d.edges][0])
             r = d.rates
-            begins = r.first if t == 0 else 1.0 - (1.0 - r.per_background * new) * math.exp(-r.per_s * dt_s)
-            leaves = 1.0 - (1.0 - r.leaves_per_background * new) * math.exp(-r.leaves_per_s * dt_s)
+            # The exponential of the generator of a chain of two states.
+            step = linalg.expm(dt_s * np.array([[-r.per_s, r.per_s], [r.leaves_per_s, -r.leaves_per_s]]))
+            begins = r.first if t == 0 else 1.0 - (1.0 - r.per_background * new) * float(step[0, 0])
+            leaves = 1.0 - (1.0 - r.leaves_per_background * new) * float(step[1, 1])
             was, now = (path[t - 1] >> i & 1 if t else 0), path[t] >> i & 1
             p = (1.0 - leaves if now else leaves) if was else (begins if now else 1.0 - begins)
             log += math.log(p) if p > 0.0 else -math.inf

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -288,8 +288,3 @@ class World:
                 self._answer[f] = self._rng.choice(3, p=RIGHT if right else WRONG)
             self._answered[f], repeats[f] = state, not first and before == self._answer[f]
         return Told(np.log(RIGHT[self._answer]), np.log(WRONG[self._answer]), repeats, MEMORY)
-
-
-def steady(priors: Priors) -> Priors:
-    """A mount that neither creeps nor moves."""
-    return replace(priors, creep_m_s=0.0, creep_rad_s=0.0)
