@@ -45,6 +45,9 @@ FIRST_FRAMES = 30
 less than such an average claims.
 """
 
+BOUND_SIGMAS = 4.5
+"""Standard deviations that a bound lies away at a risk of 1e-5: what is of second order grows with their square."""
+
 UNSETTLED_FRAMES = 5
 """Proved frames after a start in which another place within their bound is no knock: within two seconds at 15 frames/s
 (one in four is proved), in which a mount that is knocked once a month is knocked with a probability of 8e-7; that an
@@ -139,7 +142,11 @@ class Differences(NamedTuple):
         # Each by the motion that it has: a file's error does nothing where the mount stayed.
         moved = self.moved + made.shift[:, :3] - np.cross(made.shift[:, 3:], self.at)
         rows = np.moveaxis(self.by_motion @ moved.T, 2, 0)
+        # Such an error is in the motion as published, too, which they are reckoned from.
+        origin = rows[..., :3] - np.cross(rows[..., 3:], self.at)
+        second = BOUND_SIGMAS * np.einsum("kij,hlj->hkli", self.by_motion, origin).reshape(len(rows), -1, 6)
         rows[:, 0] += self.travel
+        rows = np.concatenate([rows, second], axis=1)
         return made._replace(of_model=np.concatenate([made.of_model, rows], axis=1))
 
     def staying(self, motion: Separation, covariance: Array) -> Separation:
