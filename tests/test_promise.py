@@ -143,7 +143,7 @@ def test_a_size_that_is_known_less_well_promises_less(tmp_path: Path, capsys: py
     path = tmp_path / "config.yaml"
     path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
     assert main(["check", str(path)]) == 0
-    assert "valid needs its size measured better (a length, a plate: scale_sigma in the gripper file" in capsys.readouterr().out
+    assert "valid needs its size measured better (a length, a plate: scale_sigma" in capsys.readouterr().out
 
 
 def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():

@@ -165,10 +165,12 @@ def as_if_measured(rig: Rig) -> dict[str, Rig]:
         known["a reference known better (its sigmas: gripmon calibrate plane)"] = rig._replace(taught=exact)
     if model.scale_sigma:
         exact_size = Gripper(structs.replace(model, scale_sigma=0.0))
-        known["its size measured better (a length, a plate: scale_sigma in the gripper file says how well)"] = rig._replace(gripper=exact_size)
+        size = "its size measured better (a length, a plate: scale_sigma in the gripper file says how well)"
+        known[size] = rig._replace(gripper=exact_size)
     if model.tilt_sigma_rad:
         exact_tilt = Gripper(structs.replace(model, tilt_sigma_rad=0.0))
-        known["its tilt measured better (a second opening, a plate: tilt_sigma_rad in the gripper file)"] = rig._replace(gripper=exact_tilt)
+        tilt = "its tilt measured better (a second opening, a plate: tilt_sigma_rad in the gripper file)"
+        known[tilt] = rig._replace(gripper=exact_tilt)
     return known
 
 
