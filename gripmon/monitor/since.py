@@ -45,8 +45,10 @@ FIRST_FRAMES = 30
 less than such an average claims.
 """
 
-BOUND_SIGMAS = 4.5
-"""Standard deviations that a bound lies away at a risk of 1e-5: what is of second order grows with their square."""
+MOST_SIGMAS = 2.0
+"""Standard deviations by which what is of second order is off at most: a plane's tilt is known to 15 degrees, and
+fingers that are tilted by 30 degrees more, or less, point across the view, or at the camera.
+"""
 
 UNSETTLED_FRAMES = 5
 """Proved frames after a start in which another place within their bound is no knock: within two seconds at 15 frames/s
@@ -144,9 +146,9 @@ class Differences(NamedTuple):
         rows = np.moveaxis(self.by_motion @ moved.T, 2, 0)
         # Such an error is in the motion as published, too, which they are reckoned from.
         origin = rows[..., :3] - np.cross(rows[..., 3:], self.at)
-        second = BOUND_SIGMAS * np.einsum("kij,hlj->hkli", self.by_motion, origin).reshape(len(rows), -1, 6)
+        second = MOST_SIGMAS * np.einsum("kij,hlj->hkli", self.by_motion, origin).reshape(len(rows), -1, 6)
         rows[:, 0] += self.travel
-        rows = np.concatenate([rows, second], axis=1)
+        rows = np.concatenate([second, rows], axis=1)
         return made._replace(of_model=np.concatenate([made.of_model, rows], axis=1))
 
     def staying(self, motion: Separation, covariance: Array) -> Separation:

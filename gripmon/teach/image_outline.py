@@ -19,7 +19,7 @@ from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.straight_pieces import LONGEST_CUT_PX, Chain, fit_chains, runs, without_outliers
+from gripmon.teach.straight_pieces import Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""
@@ -229,7 +229,7 @@ def _fingers(
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
         along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
-        for run, closed in runs(found.usable | (found.shown & _short_gaps(found.usable)), points):
+        for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
                 camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
@@ -255,17 +255,6 @@ def _fingers(
         for part, outwards in zip(parts.fingers, parts.outwards, strict=True)
     )
     return fingers, borders
-
-
-def _short_gaps(usable: Bits) -> Bits:
-    """Stations (s,) of stretches that too few images show, no longer than a corner that the smoothed contour cuts off:
-    a run goes on across them, and its pieces there are measured or left out.
-    """
-    starts = np.flatnonzero(np.diff(np.concatenate([[True], usable, [True]]).astype(np.int8)))
-    out = np.zeros(len(usable), bool)
-    for first, last in starts.reshape(-1, 2):
-        out[first:last] = last - first <= LONGEST_CUT_PX
-    return out
 
 
 def _names(centres_px: Sequence[Array]) -> list[str]:

@@ -70,7 +70,7 @@ class Transitions:
     ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
     edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
-    each image's transitions over that of all; ``shown`` (s,): something is, be it the same everywhere; ``clear`` and
+    each image's transitions over that of all; ``clear`` and
     ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
     """
 
@@ -81,7 +81,6 @@ class Transitions:
     shift_px: Array
     worth: Array
     sharpness: Array
-    shown: NDArray[np.bool_]
     clear: NDArray[np.intp]
     different: NDArray[np.intp]
     level: Array
@@ -174,8 +173,7 @@ def measure_transitions(
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
-    shown = usable
-    usable = shown & (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
+    usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
     if blur_px is None:
@@ -191,7 +189,7 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, shown, clear, different, usual)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
