@@ -21,9 +21,9 @@ _HALVINGS = 24  # of at most 40 sigmas: to a part in 400,000 of a sigma
 
 
 @compiled
-def place(bank: Bank, n: int, mean: Array) -> int:
-    """The heaviest hypothesis of ``n``; ``mean`` (23,) becomes that of all that say the same as it, whatever they
-    doubt: it doesn't jump between doubts.
+def place(bank: Bank, n: int, mean: Array) -> None:
+    """``mean`` (23,) becomes that of all of ``n`` hypotheses that say the same as the heaviest, whatever they doubt: it
+    doesn't jump between doubts.
     """
     best = 0
     for h in range(n):
@@ -40,7 +40,6 @@ def place(bank: Bank, n: int, mean: Array) -> int:
                 mean[j] += weight * bank.mean[h, j]
     for j in range(SIZE):
         mean[j] /= total
-    return best
 
 
 @compiled

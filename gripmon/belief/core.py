@@ -162,8 +162,8 @@ class Belief:
     ) -> Believed:
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
         0. ``hidden_knock``: probability of a knock that is due in this frame because no end is shown (policy; once for
-        each such stretch), beside that of the rate; hypotheses that begin to
-        doubt all ends have it in any case.  Raises ValueError unless time goes on.
+        each such stretch), beside that of the rate; hypotheses that begin to doubt all ends have it in any
+        case.  Raises ValueError unless time goes on.
         """
         first = self._first
         if not dt_s > 0.0:
@@ -206,11 +206,11 @@ class Belief:
         n = 0
         for h in range(self._hypotheses):
             self._node(h, h, -1, float(bank.log_weight[h]), nothing, asked)
-            if self._everything:
-                n = put_all(candidates, n, nodes, h, bank, asked)
-            else:
+            if not self._everything:
                 n = put(candidates, n, nodes, h, int(bank.doubts[h]), bank, asked)
         if self._everything:
+            for h in range(self._hypotheses):
+                n = put_all(candidates, n, nodes, h, bank, asked)
             return n
         least = -math.log(self.least)
         if not asked.first:
@@ -290,13 +290,21 @@ class Belief:
     def bound(self, risk: float) -> Bound:
         """Of the last frame, at another risk; that of the filter is the smallest for which enough is kept."""
         left = 0.0 if self._lost else 0.5 * risk - self._dropped
-        asked = np.zeros((4, 3, SIZE))
-        asked[0, :, MOTION][:, :3] = asked[1, :, MOTION][:, 3:] = np.eye(3)
-        asked[2], asked[3] = asked[0], asked[1]
-        asked[2, :, REFERENCE][:, :3] = asked[3, :, REFERENCE][:, 3:] = np.eye(3)
         floors = (bounds.SPLIT_M, bounds.SPLIT_RAD) * 2
         of = (self._bank, self._hypotheses, self._mean)
-        return Bound(*(float(bounds.bound(*of, a, f, left)) for a, f in zip(asked, floors, strict=True)))
+        return Bound(*(float(bounds.bound(*of, a, f, left)) for a, f in zip(_BOUNDED, floors, strict=True)))
+
+
+def _bounded() -> Array:
+    asked = np.zeros((4, 3, SIZE))
+    asked[0, :, MOTION][:, :3] = asked[1, :, MOTION][:, 3:] = np.eye(3)
+    asked[2:] = asked[:2]
+    asked[2, :, REFERENCE][:, :3] = asked[3, :, REFERENCE][:, 3:] = np.eye(3)
+    return asked
+
+
+_BOUNDED = _bounded()
+"""(4, 3, 23): which combinations of g :class:`Bound` is about, in its order."""
 
 
 def _diagonal(sigmas: Sequence[float]) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -93,18 +93,7 @@ class Table(NamedTuple):
             raise ValueError(f"{len(doubts)} doubts about {len(doubts[0].edges)} edges; at most {MOST_DOUBTS} of each")
         ends = np.array([_bits([d.ends[f] for d in doubts]) for f in range(len(doubts[0].ends))], np.int64)
         every = [bool(d.ends.any() and d.ends.all()) for d in doubts]
-        rates = np.array(
-            [
-                (
-                    d.rates.first,
-                    d.rates.per_s,
-                    d.rates.per_background,
-                    d.rates.leaves_per_s,
-                    d.rates.leaves_per_background,
-                )
-                for d in doubts
-            ]
-        )
+        rates = np.array([astuple(d.rates) for d in doubts])
         return cls(
             np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
             _bits([d.fooled for d in doubts]), _bits(every), rates,
@@ -126,6 +115,8 @@ class Onsets:
 
     def __init__(self, table: Table) -> None:
         self._table = table
+        self._alone = np.array([not (table.held >> d) & 1 for d in range(len(table.edges))])
+        self._edge = np.array([int(bits).bit_length() - 1 for bits in table.edges])  # of those alone, the only one
         self._waits = np.zeros(len(table.edges))  # log probability of not having begun unseen
         self._leaves = np.zeros(len(table.edges))
         self._first = True
@@ -135,11 +126,8 @@ class Onsets:
         table, first = self._table, self._first
         rates = table.rates.T
         shown = _bits(seen.shown)
-        alone = np.array([not (table.held >> d) & 1 for d in range(len(table.edges))])
-        silent = alone & ((table.edges & shown) == 0)
-        new = np.zeros(len(table.edges))
-        for d in np.flatnonzero(alone & ~silent):
-            new[d] = 1.0 - seen.likeness[int(table.edges[d]).bit_length() - 1]
+        silent = self._alone & ((table.edges & shown) == 0)
+        new = np.where(self._alone & ~silent, 1.0 - seen.likeness[self._edge], 0.0)
         if first:
             self._waits += np.log1p(-rates[0])
         else:

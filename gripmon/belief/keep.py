@@ -10,7 +10,7 @@ from gripmon.belief.doubts import Table, edges_of
 from gripmon.belief.nodes import Nodes, weigh
 from gripmon.belief.rows import add_noise, foreign, forward, learn
 from gripmon.belief.search import Candidates
-from gripmon.belief.state import SIZE, Bank, Ints, Seen
+from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -39,7 +39,7 @@ def same_place(mean: Array, covariance: Array, other: Array, other_covariance: A
     """Whether two hypotheses say the same of d and the opening: means within a sigma of the surer, variances within a
     factor of two.  Never a wide one with a narrow one: its tail is the bound.
     """
-    for j in (0, 1, 2, 3, 4, 5, 18):
+    for j in (0, 1, 2, 3, 4, 5, OPENING):
         a, b, away = covariance[j, j], other_covariance[j, j], mean[j] - other[j]
         if away * away > min(a, b) or max(a, b) > 2.0 * min(a, b):
             return False

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gripmon.belief.state import FOREIGN_KINDS, SIZE, STILL, Bank, Seen
+from gripmon.belief.state import FOREIGN_KINDS, LIGHT, SIZE, STILL, Bank, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -68,15 +68,15 @@ def move(bank: Bank, h: int, lag: float, light: float) -> None:
     mean, covariance, slope = bank.mean[h], bank.covariance[h], bank.slope[h]
     for i in range(6, 12):
         mean[i] += lag * (mean[i - 6] - mean[i])
-    mean[21] *= light
+    mean[LIGHT] *= light
     for j in range(SIZE):
         for i in range(6, 12):
             covariance[i, j] += lag * (covariance[i - 6, j] - covariance[i, j])
-        covariance[21, j] *= light
+        covariance[LIGHT, j] *= light
     for i in range(SIZE):
         for j in range(6, 12):
             covariance[i, j] += lag * (covariance[i, j - 6] - covariance[i, j])
-        covariance[i, 21] *= light
+        covariance[i, LIGHT] *= light
     for i in range(6):  # without creep p comes so near d that the covariance would have no root
         covariance[6 + i, 6 + i] += LEAST_APART**2
     for q in range(slope.shape[0]):
@@ -85,7 +85,7 @@ def move(bank: Bank, h: int, lag: float, light: float) -> None:
             for i in range(6, 12):
                 own[i] /= 1.0 - lag
                 own[i - 6] -= lag * own[i]
-            own[21] /= light
+            own[LIGHT] /= light
 
 
 @compiled
