@@ -41,7 +41,8 @@ class PlacedOutlines:
     unknown; ``kept`` pieces of each; ``rotation`` (3, 3) of ``cam_T_grip``, ``tcp`` (3,) with z = 1; ``flat``: the
     fingers' direction is unknown; ``sigma_rad`` (3,) of the rotation, camera axes.  ``round_tips``: some tips are taken
     to lie in the plane of their sides; ``by_motion``: depths come from the fingers' motion with the jaws;
-    ``tcp_covariance`` (3, 3) and ``slope_sigma`` (2,) of their plane then; ``assumed``: nothing tells its tilt.
+    ``tcp_covariance`` (3, 3) then; ``tilt_sigma_rad`` of their plane, as a gripper file has it; ``assumed``: nothing
+    tells it.
     """
 
     points: tuple[Array, ...]
@@ -55,14 +56,7 @@ class PlacedOutlines:
     normal: Array | None = None
     tcp_covariance: Array | None = None
     assumed: bool = False
-    slope_sigma: Array | None = None
-
-    @property
-    def tilt_sigma_rad(self) -> float:
-        """Standard deviation of the tilt of the points' plane, as a gripper file has it."""
-        if self.slope_sigma is not None:  # how a taper's sides spread about z is no error of their depths
-            return float(self.slope_sigma.max())
-        return USUAL_TILT_SIGMA_RAD if self.assumed else float(self.sigma_rad.max())
+    tilt_sigma_rad: float = 0.0
 
 
 def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array | None = None) -> PlacedOutlines:
@@ -98,7 +92,8 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         tuple(piece for piece in finger.pieces if np.isfinite(p[list(piece)]).all())
         for finger, p in zip(fingers, points, strict=True)
     )
-    return PlacedOutlines(tuple(points), kept, rotation, tcp, False, np.full(3, sigma), any(turns))
+    placed = tuple(points), kept, rotation, tcp, False, np.full(3, sigma)
+    return PlacedOutlines(*placed, any(turns), tilt_sigma_rad=sigma)
 
 
 def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tuple[int, int]]]:
@@ -236,7 +231,10 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         tuple(piece for piece in f.pieces if np.isfinite(own[list(piece)]).all())
         for f, own in zip(fingers, points, strict=True)
     )
-    return PlacedOutlines(tuple(points), kept, rotation, tcp, True, sigma, normal=normal, assumed=assumed)
+    made = tuple(points), kept, rotation, tcp, True, sigma
+    return PlacedOutlines(
+        *made, normal=normal, assumed=assumed, tilt_sigma_rad=USUAL_TILT_SIGMA_RAD if assumed else 0.0
+    )
 
 
 def _usual_axes(fingers: Sequence[Outline], at: Array) -> tuple[Array, Array, Array]:

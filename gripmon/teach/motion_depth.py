@@ -154,6 +154,7 @@ def place_by_motion(
     sigma = np.hypot(sigma, 0.5 * float(np.mean(spreads)))
     made = tuple(points), found.kept, rotation, tcp, False, sigma
     found = found.over(depth)
-    return PlacedOutlines(
-        *made, by_motion=True, tcp_covariance=found.tcp_covariance, slope_sigma=found.slope_sigma
-    ), found
+    # How a taper's sides spread about z is no error of their depths: of the tilt the slopes alone.
+    tilt_sigma_rad = float(found.slope_sigma.max())
+    placed = PlacedOutlines(*made, by_motion=True, tcp_covariance=found.tcp_covariance, tilt_sigma_rad=tilt_sigma_rad)
+    return placed, found
