@@ -73,7 +73,10 @@ class HandEyeCalibration(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
     tag="gripmon.hand_eye_calibration/1",
 ):  # fmt: skip
-    """``cam_T_grip`` with the covariance of its error (position of the TCP, then rotation, camera axes; m, rad)."""
+    """``cam_T_grip`` with the covariance of its error (position of the TCP, then rotation, camera axes; m, rad).
+
+    ``with_gripper``: the gripper file was made of the same images, whose errors of size and tilt this has as well.
+    """
 
     camera: LensSettings
     gripper: CalibratedGripper
@@ -81,6 +84,7 @@ class HandEyeCalibration(
     cam_T_grip: Transform
     covariance: Covariance
     residuals: HandEyeResiduals
+    with_gripper: bool = False
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

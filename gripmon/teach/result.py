@@ -26,7 +26,8 @@ class GripperResult:
 
     Where the maker knows it, the gripper's pose before a camera ``lens``: ``cam_T_grip`` (4, 4), the ``covariance``
     (6, 6) of its error (position of the TCP, then rotation, camera axes; None: it is only a view), at the opening
-    ``opening_m`` of a moving jaw, from so many ``corners`` in so many ``images``, which fit to ``rms_px``, ``rms_m``.
+    ``opening_m`` of a moving jaw, from so many ``corners`` in so many ``images``, which fit to ``rms_px``, ``rms_m``;
+    ``with_gripper``: the gripper is made of the same images, whose errors of size and tilt both have.
     """
 
     gripper: Gripper
@@ -39,6 +40,7 @@ class GripperResult:
     images: int = 1
     rms_px: float = 0.0
     rms_m: float = 0.0
+    with_gripper: bool = False
 
     @property
     def model(self) -> GripperModel:
@@ -60,6 +62,7 @@ class GripperResult:
             cam_T_grip=to_record(self.cam_T_grip),
             covariance=tuple(self.covariance.ravel().tolist()),
             residuals=HandEyeResiduals(rms_m=self.rms_m, rms_px=self.rms_px, corners=self.corners, images=self.images),
+            with_gripper=self.with_gripper,
             warnings=self.notes,
             provenance=provenance,
         )

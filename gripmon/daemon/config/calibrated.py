@@ -36,7 +36,11 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
     if isinstance(values.get("reference"), str):
         paths["reference"] = named_file(path, "reference", values["reference"], _PLANE, _OR)
         hand_eye = read_document(paths["reference"], HandEyeCalibration)
-        values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
+        values["reference"] = {
+            "cam_T_grip": _as_read(hand_eye.cam_T_grip),
+            "covariance": list(hand_eye.covariance),
+            "with_gripper": hand_eye.with_gripper,
+        }
     return values, CalibrationFiles(paths, hand_eye)
 
 

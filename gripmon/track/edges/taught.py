@@ -29,7 +29,7 @@ from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.gripper.core import POLARITY
-from gripmon.model.records import Array, Transform
+from gripmon.model.records import Array, ReferenceRecord, Transform
 from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
@@ -238,9 +238,9 @@ class TaughtEdges:
         offset: Sequence[float] = (0.0,) * 6,
         images_covariance: Sequence[float] | None = None,
     ) -> TaughtEdges:
-        """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
-        it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of which
-        ``images_covariance`` says as above how well they show it, None if not at all.
+        """Arrays of edges taught at a pose and a jaw opening; ``covariance``: :func:`own_covariance` of the pose; None
+        where it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of
+        which ``images_covariance`` says as above how well they show it, None if not at all.
         """
         untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
         listed = [edges.get(name, untaught) for name in gripper.edge_ids]
@@ -294,13 +294,31 @@ class TaughtEdges:
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
 
 
+def own_covariance(reference: ReferenceRecord, gripper: Gripper) -> tuple[float, ...]:
+    """(36,) covariance of what a reference is off by besides the gripper file's errors, row by row.
+
+    Made of the same images as the file, it is off by these errors: a size, along the line of sight, and a tilt, which
+    the file states itself.
+    """
+    if not reference.with_gripper:
+        return reference.covariance
+    kept = np.eye(6)
+    if gripper.model.scale_sigma:
+        at_m = np.array(reference.cam_T_grip.translation_m)
+        kept[:3, :3] -= np.outer(at_m, at_m) / float(at_m @ at_m)
+    if gripper.model.tilt_sigma_rad:
+        kept[3:, 3:] = 0.0
+    own = kept @ np.reshape(reference.covariance, (6, 6)) @ kept.T
+    return tuple(own.ravel().tolist())
+
+
 def _error(covariance: Sequence[float], images_covariance: Sequence[float] | None) -> Array:
     """(6, 6) one standard deviation along each of six directions of a pose of which two things tell, independently."""
     both = np.reshape(covariance, (6, 6))
     if images_covariance is not None:
         both = both - both @ np.linalg.solve(both + np.reshape(images_covariance, (6, 6)), both)
-        both = 0.5 * (both + both.T)
-    return np.asarray(np.linalg.cholesky(both).T)
+    variances, directions = np.linalg.eigh(0.5 * (both + both.T))
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0))[:, None] * directions.T)
 
 
 def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tuple[Array, Array]:
