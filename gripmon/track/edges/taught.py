@@ -206,10 +206,10 @@ class TaughtEdges:
     ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
     taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
     gripper (1: brighter to the right); ``shown`` (e,): part of it that showed.  An edge that isn't known has no shift,
-    and is expected to show.  ``usual_m``: root mean square offset of
-    the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
-    at, which their offsets have in them: one standard deviation along each of k directions, m and rad, given both the
-    reference's own covariance and what the teaching images show of where the gripper was.
+    and is expected to show.  ``usual_m``: root mean square offset of the taught edges that were seen, which others may
+    have, too.  ``reference_error`` (k, 6): of the reference that they were taught at, which their offsets have in them:
+    one standard deviation along each of k directions, m and rad, given both the reference's own covariance and what the
+    teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
     poses are off by as much if the camera moved since the calibration.
     """
@@ -260,7 +260,7 @@ class TaughtEdges:
             np.array([e.depth_sigma_m for e in listed]),
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             np.array([e.seen for e in listed]),
-            float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
+            _usual_m(edges),
             np.zeros((0, 6)) if covariance is None else _error(covariance, images_covariance),
             np.array(offset),
         )
@@ -292,6 +292,12 @@ class TaughtEdges:
         """
         across, _ = sight_axes(gripper, points_grip_m, cam_T_grip)
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
+
+
+def _usual_m(edges: Mapping[str, TaughtEdge]) -> float:
+    """Root mean square offset of the edges that were seen; 0 without any."""
+    offsets_m = [edge.offset_m for edge in edges.values() if edge.seen > 0.0]
+    return float(np.sqrt(np.mean(np.square(offsets_m)))) if offsets_m else 0.0
 
 
 def own_covariance(reference: ReferenceRecord, gripper: Gripper) -> tuple[float, ...]:
