@@ -77,6 +77,19 @@ def test_files_and_sections_say_the_same(folder: Path):
     assert by_files.reference.covariance == COVARIANCE and not by_files.reference.with_gripper
 
 
+def test_the_response_that_a_references_images_show_holds_where_nothing_else_is_said(folder: Path):
+    def response() -> tuple[str, bool]:
+        config = load_config(folder / "arm.yaml")
+        return config.settings.monitor.corners.edges.response, config.knows_response
+
+    assert response() == ("linear", False)
+    change(folder / "hand_eye.yaml", lambda v: v.update(response="unknown"))
+    assert response() == ("unknown", True)
+    said = {"corners": {"edges": {"response": "srgb"}}}
+    change(folder / "arm.yaml", lambda v: v.setdefault("monitor", {}).update(said))
+    assert response() == ("srgb", True)
+
+
 def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):
     """Through a configuration's file or section, to what is taught."""
     change(folder / "hand_eye.yaml", lambda v: v.update(with_gripper=True))

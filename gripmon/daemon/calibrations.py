@@ -326,8 +326,7 @@ def plane_inputs(
 
 def said_response(config: Config) -> str:
     """How grey levels follow the light by a configuration or what it was taught with; auto if neither says it."""
-    said = config.says_response or config.taught is not None
-    return config.settings.monitor.corners.edges.response if said else "auto"
+    return config.settings.monitor.corners.edges.response if config.knows_response else "auto"
 
 
 def measure_again(

@@ -73,7 +73,14 @@ class Config:
     taught: TaughtModel | None = None
     calibrated: CalibrationFiles = field(default_factory=CalibrationFiles)
     says_response: bool = True
-    """Whether the file itself says ``monitor.corners.edges.response``; else a taught model does."""
+    """Whether the file itself says ``monitor.corners.edges.response``; else a taught model does, or the reference's
+    file.
+    """
+
+    @property
+    def knows_response(self) -> bool:
+        """Whether anything says how grey levels follow the light; else linear is assumed."""
+        return self.says_response or self.taught is not None or self.calibrated.response is not None
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
@@ -157,6 +164,9 @@ def load_config(
     gripper = read_gripper(gripper_path)
     reference = _reference(path, settings, gripper, calibrated)
     said = "response" in _within(values, "monitor", "corners", "edges")
+    if not said and calibrated.response is not None:
+        monitor = settings.monitor.with_response(calibrated.response)
+        settings = msgspec.structs.replace(settings, monitor=monitor)
     config = Config(path, settings, camera, gripper, gripper_path, reference, None, calibrated, said)
     fault = (
         monitor_fault(settings.monitor)

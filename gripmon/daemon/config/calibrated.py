@@ -13,6 +13,7 @@ from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import named_file, read_document
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
+from gripmon.model.response import Response
 from gripmon.track.edges.taught import gripper_digest
 
 _INTRINSICS, _PLANE = "a file of gripmon calibrate intrinsics", "a file of gripmon calibrate plane"
@@ -25,6 +26,11 @@ class CalibrationFiles:
 
     paths: dict[str, Path] = field(default_factory=dict)
     hand_eye: HandEyeCalibration | None = None
+
+    @property
+    def response(self) -> Response | None:
+        """How grey levels follow the light, where the reference's images show it."""
+        return None if self.hand_eye is None else self.hand_eye.response
 
 
 def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], CalibrationFiles]:
