@@ -109,6 +109,9 @@ class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     right: Look | None = None
 
 
+_UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
+
+
 class TaughtCorner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where the taught edges meet at the reference and the first image's jaw opening."""
 
@@ -206,10 +209,10 @@ class TaughtEdges:
     ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
     taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
     gripper (1: brighter to the right); ``shown`` (e,): part of it that showed.  An edge that isn't known has no shift,
-    and is expected to show.  ``usual_m``: root mean square offset of the taught edges that were seen, which others may
-    have, too.  ``reference_error`` (k, 6): of the reference that they were taught at, which their offsets have in them:
-    one standard deviation along each of k directions, m and rad, given both the reference's own covariance and what the
-    teaching images show of where the gripper was.
+    and is expected to show.  ``usual_m`` (e,): root mean square offset of the taught edges of its kind that were seen,
+    which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught at, which their
+    offsets have in them: one standard deviation along each of k directions, m and rad, given both the reference's own
+    covariance and what the teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
     poses are off by as much if the camera moved since the calibration.
     """
@@ -223,7 +226,7 @@ class TaughtEdges:
     depth_sigma_m: Array
     polarity: NDArray[np.int8]
     shown: Array
-    usual_m: float
+    usual_m: Array
     reference_error: Array
     reference_offset: Array
 
@@ -242,9 +245,10 @@ class TaughtEdges:
         where it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of
         which ``images_covariance`` says as above how well they show it, None if not at all.
         """
-        untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
-        listed = [edges.get(name, untaught) for name in gripper.edge_ids]
-        across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
+        listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
+        points_grip_m = gripper.points_grip_m(jaw_opening_m)
+        across, depth = sight_axes(gripper, points_grip_m, cam_T_grip)
+        crease = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3]).crease
         share = np.array([e.share for e in listed])
         offset_m = np.array([e.offset_m for e in listed])
         slope_m = (offset_m[:, 1] - offset_m[:, 0]) / (share[:, 1] - share[:, 0])
@@ -260,7 +264,7 @@ class TaughtEdges:
             np.array([e.depth_sigma_m for e in listed]),
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             np.array([e.seen for e in listed]),
-            _usual_m(edges),
+            _usual_m(listed, crease),
             np.zeros((0, 6)) if covariance is None else _error(covariance, images_covariance),
             np.array(offset),
         )
@@ -294,10 +298,16 @@ class TaughtEdges:
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
 
 
-def _usual_m(edges: Mapping[str, TaughtEdge]) -> float:
-    """Root mean square offset of the edges that were seen; 0 without any."""
-    offsets_m = [edge.offset_m for edge in edges.values() if edge.seen > 0.0]
-    return float(np.sqrt(np.mean(np.square(offsets_m)))) if offsets_m else 0.0
+def _usual_m(edges: Sequence[TaughtEdge], crease: NDArray[np.bool_]) -> Array:
+    """(e,) root mean square offset of the taught ``edges`` (e,) that were seen, for outlines that of outlines, for
+    others, by ``crease`` (e,), that of creases, or of all where there is none of the kind; 0 without any.
+    """
+    seen = [edge for edge in edges if edge is not _UNTAUGHT and edge.seen > 0.0]
+    out = np.zeros(len(edges))
+    for kind in (False, True) if seen else ():
+        same = [edge.offset_m for edge in seen if edge.crease == kind] or [edge.offset_m for edge in seen]
+        out[crease == kind] = np.sqrt(np.mean(np.square(same)))
+    return out
 
 
 def own_covariance(reference: ReferenceRecord, gripper: Gripper) -> tuple[float, ...]:
