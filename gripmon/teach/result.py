@@ -139,7 +139,7 @@ _ABOUT = {
     "points": "x, y, z (m) at the nominal opening; `corner: true`: measured as a fingertip corner; `round`: on the "
     "outline of a part that is round about an axis",
     "edges": "between two points, straight, or curved through the points `via`; `kind`: where faces don't say; "
-    "`bevel_m`: width of a bevel (m)",
+    "`bevel_m`: width of a bevel, or of where the edge may lie (m)",
     "faces": "loops of points, counter-clockwise seen from outside; they decide what is visible",
     "jaw": "openings (m): smallest, largest, and the one at which the coordinates below hold",
     "scale_sigma": "standard deviation of a factor on all lengths; 1: the size is unknown",
