@@ -13,6 +13,7 @@ import pytest
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.daemon.calibrations import read_calibrated
 from gripmon.daemon.config import ConfigError, is_second, load_config, load_second, read_gripper
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.judge.statefile import calibration_of
@@ -73,7 +74,32 @@ def test_files_and_sections_say_the_same(folder: Path):
     assert by_files.settings == by_sections.settings and by_files.reference == by_sections.reference
     assert by_files.calibrated.paths == {"camera": folder / "camera.yaml", "reference": folder / "hand_eye.yaml"}
     assert by_sections.calibrated.paths == {}
-    assert by_files.reference.covariance == COVARIANCE
+    assert by_files.reference.covariance == COVARIANCE and not by_files.reference.with_gripper
+
+
+def test_the_response_that_a_references_images_show_holds_where_nothing_else_is_said(folder: Path):
+    def response() -> tuple[str, bool]:
+        config = load_config(folder / "arm.yaml")
+        return config.settings.monitor.corners.edges.response, config.knows_response
+
+    assert response() == ("linear", False)
+    change(folder / "hand_eye.yaml", lambda v: v.update(response="unknown"))
+    assert response() == ("unknown", True)
+    said = {"corners": {"edges": {"response": "srgb"}}}
+    change(folder / "arm.yaml", lambda v: v.setdefault("monitor", {}).update(said))
+    assert response() == ("srgb", True)
+
+
+def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):
+    """Through a configuration's file or section, to what is taught."""
+    change(folder / "hand_eye.yaml", lambda v: v.update(with_gripper=True))
+    by_files = load_config(folder / "arm.yaml")
+    change(folder / "arm.yaml", lambda v: v.update(sections()))
+    change(folder / "arm.yaml", lambda v: v["reference"].update(with_gripper=True))
+    by_sections = load_config(folder / "arm.yaml")
+    assert by_files.reference == by_sections.reference and by_files.reference.with_gripper
+    for file in ("hand_eye.yaml", "arm.yaml"):
+        assert read_calibrated(folder / file).with_gripper
 
 
 @pytest.mark.parametrize(

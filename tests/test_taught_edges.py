@@ -111,6 +111,11 @@ def test_edges_that_were_not_taught_may_lie_as_far_off_as_those_that_were():
     usual_m = np.sqrt(0.5 * (1.0 + 4.0)) * 1e-4
     other = GRIPPER.edge_ids.index("R_tip_in")
     assert found.edge_spread_m[other] == pytest.approx(usual_m) and found.edge_spread_m[EDGE] < 2e-6
+    unseen = taught_edge(offset_m=(1e-3, 1e-3), seen=0.0)  # where the others have it, by how much doesn't count
+    inner = taught_edge(offset_m=(5e-4, 5e-4), crease=True)  # inner edges lie farther off than outlines
+    known = {"L_tip_near": taught_edge(offset_m=(1e-4, 2e-4)), "L_tip_in": unseen, "L_in_near_along": inner}
+    again = predicted(known, POSE)
+    assert again.edge_spread_m[other] == pytest.approx(usual_m)
 
 
 def test_the_width_is_what_teaching_left():

@@ -15,7 +15,7 @@ from support.watched import pose_of, reference_of
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import EdgeModel, FaceModel, FingerModel, Gripper, GripperModel, PointModel, contents_of
-from gripmon.model.records import Array, ValidBy
+from gripmon.model.records import Array, ReferenceRecord, ValidBy
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
 from gripmon.simulate import Scenario, Simulator
@@ -23,7 +23,7 @@ from gripmon.simulate.scenario import Background, Bump, FingerLook
 from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, place
 from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, gripper_digest, own_covariance
 from gripmon.track.integrity import Separation
 
 FILE_T = nominal_cam_T_grip(np.degrees(USUAL_TILT_RAD))
@@ -162,6 +162,65 @@ def test_it_turns_the_absolute_rotation_alone():
     assert not turned[:3].any()
     expected = USUAL_TILT_SIGMA_RAD**2 * (np.eye(3) - np.outer(FILE_T[:3, 1], FILE_T[:3, 1]))
     np.testing.assert_allclose(turned[3:, 3:], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("tilt_deg", "roll_deg"), [(50.0, 0.0), (35.0, 20.0)])
+@pytest.mark.parametrize("size", [0.9, 1.05])
+def test_a_wrong_size_and_tilt_leave_nothing_to_teach_at_a_reference_of_the_same_images(
+    tilt_deg: float, roll_deg: float, size: float
+):
+    """So that what is taught has no error of theirs in it; at a reference from elsewhere it has."""
+    true_T = true_pose(tilt_deg, roll_deg)
+    file, edges = file_of(true_T), np.arange(6)
+    own_T = FILE_T.copy()
+    own_T[:3, 3] *= size
+    larger = plates({f: size * file.points_grip_m()[4 * k : 4 * k + 4] for k, f in enumerate(file.finger_ids)})
+
+    def shown(gripper: Gripper, pose: Array) -> Array:
+        places = gripper.outlines_m(gripper.points_grip_m() @ pose[:3, :3].T + pose[:3, 3], edges, 2)
+        return np.asarray(places[..., :2] / places[..., 2:])
+
+    truth = shown(true_plates(), true_T)
+    np.testing.assert_allclose(shown(larger, own_T), truth, atol=1e-12)
+    assert np.abs(shown(larger, true_T) - truth).max() > 1e-3
+
+
+def own_reference(sigmas: tuple[float, float, float]) -> ReferenceRecord:
+    """Off along the line of sight, beside it, and in rotation, by these standard deviations."""
+    along, beside, turn = sigmas
+    sight = FILE_T[:3, 3] / np.linalg.norm(FILE_T[:3, 3])
+    covariance = np.diag([beside**2] * 3 + [turn**2] * 3)
+    covariance[:3, :3] += (along**2 - beside**2) * np.outer(sight, sight)
+    flat = tuple(covariance.ravel().tolist())
+    return msgspec.structs.replace(reference_of(FILE_T), covariance=flat, with_gripper=True)
+
+
+def test_an_error_that_file_and_reference_have_together_counts_once():
+    """In the absolute bound; a reference from elsewhere has errors of its own."""
+    size, beside_m, distance_m = 0.03, 1e-5, float(np.linalg.norm(FILE_T[:3, 3]))
+    reference = own_reference((size * distance_m, beside_m, USUAL_TILT_SIGMA_RAD))
+    model = msgspec.structs.replace(file_of(FILE_T).model, scale_sigma=size)
+    edge = {"left1": TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)}
+    fits = Separation(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 1, 6)))
+    sight = FILE_T[:3, 3] / distance_m
+
+    def sigmas(reference: ReferenceRecord, **states: float) -> tuple[float, float, float]:
+        """Along the line of sight and beside it, and of the rotation's longest axis; taught with a file's statements
+        replaced."""
+        gripper = Gripper(msgspec.structs.replace(model, **states))
+        taught = TaughtEdges.of(edge, gripper, FILE_T, None, own_covariance(reference, gripper))
+        rows = taught.reference_error, np.zeros(6), Tilt.of(gripper, FILE_T)
+        off = CommonError(gripper.model.scale_sigma, *rows).on(fits, FILE_T).of_model[0]
+        beside = np.linalg.norm(off[:, :3] @ np.linalg.svd(sight[None])[2][1])
+        return float(np.linalg.norm(off[:, :3] @ sight)), float(beside), float(np.linalg.norm(off[:, 3:], 2))
+
+    once = size * distance_m, beside_m, USUAL_TILT_SIGMA_RAD
+    twice = 2.0**0.5 * once[0], beside_m, 2.0**0.5 * once[2]
+    np.testing.assert_allclose(sigmas(reference), once, rtol=1e-6)
+    elsewhere = msgspec.structs.replace(reference, with_gripper=False)
+    np.testing.assert_allclose(sigmas(elsewhere), twice, rtol=1e-6)
+    # What the file doesn't state, the reference alone has.
+    np.testing.assert_allclose(sigmas(reference, scale_sigma=0.0, tilt_sigma_rad=0.0), once, rtol=1e-6)
 
 
 def test_a_file_that_states_none_is_as_before():

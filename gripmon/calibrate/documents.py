@@ -14,6 +14,7 @@ from gripmon.model.geometry import invert, to_record
 from gripmon.model.provenance import Digest, Provenance
 from gripmon.model.records import Transform
 from gripmon.model.records.values import Covariance
+from gripmon.model.response import Response
 
 if TYPE_CHECKING:
     from gripmon.calibrate.robot_world import RobotWorld
@@ -73,7 +74,11 @@ class HandEyeCalibration(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
     tag="gripmon.hand_eye_calibration/1",
 ):  # fmt: skip
-    """``cam_T_grip`` with the covariance of its error (position of the TCP, then rotation, camera axes; m, rad)."""
+    """``cam_T_grip`` with the covariance of its error (position of the TCP, then rotation, camera axes; m, rad).
+
+    ``with_gripper``: the gripper file was made of the same images, whose errors of size and tilt this has as well, and
+    which show the camera's ``response``.
+    """
 
     camera: LensSettings
     gripper: CalibratedGripper
@@ -81,6 +86,8 @@ class HandEyeCalibration(
     cam_T_grip: Transform
     covariance: Covariance
     residuals: HandEyeResiduals
+    with_gripper: bool = False
+    response: Response | None = None
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -37,7 +37,8 @@ _SEED = 7
 class Calibrated:
     """A calibration to compare, with its ``name``: a ``lens`` with the covariance of its ``parameters``, a
     ``cam_T_grip`` with ``covariance`` (36), or both; ``kind`` is where it comes from, ``target`` what it was
-    made with, if that is known, ``notes`` describe its origin for people, ``pose_notes`` add to the transform's.
+    made with, if that is known, ``notes`` describe its origin for people, ``pose_notes`` add to the transform's;
+    ``with_gripper``: the gripper file was made of the same images.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Calibrated:
     lens_covariance: tuple[float, ...] = ()
     cam_T_grip: Transform | None = None
     covariance: tuple[float, ...] = ()
+    with_gripper: bool = False
     gripper: CalibratedGripper | None = None
     jaw_opening_m: float | None = None
     target: str | None = None

@@ -127,10 +127,10 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
 
 
 def unlike_light(config: Config, image: Image) -> str | None:
-    """What is odd about an image's grey levels: a colour camera's, of which neither the configuration nor a taught
-    model says how they follow the light.
+    """What is odd about an image's grey levels: a colour camera's, of which neither the configuration, a taught model
+    nor the reference says how they follow the light.
     """
-    if config.says_response or config.settings.taught is not None or likely_linear([image]):
+    if config.knows_response or config.settings.taught is not None or likely_linear([image]):
         return None
     return "nothing says how the grey levels of this colour camera follow the light: gripmon teach finds it"
 

@@ -113,6 +113,7 @@ def _hand_eye(path: Path) -> Calibrated:
         found.camera,
         cam_T_grip=found.cam_T_grip,
         covariance=found.covariance,
+        with_gripper=found.with_gripper,
         gripper=found.gripper,
         jaw_opening_m=found.jaw_opening_m,
         target=target_of_command(found.provenance.command),
@@ -133,6 +134,7 @@ def _configuration(path: Path) -> Calibrated:
         config.settings.camera,
         cam_T_grip=reference.cam_T_grip,
         covariance=reference.covariance,
+        with_gripper=reference.with_gripper,
         gripper=CalibratedGripper(name=config.gripper.name, sha256=gripper_digest(config.gripper)),
         pose_notes=(f"the configured reference {reference.reference_id}", *_uncertainty(reference.covariance)),
     )
@@ -324,8 +326,7 @@ def plane_inputs(
 
 def said_response(config: Config) -> str:
     """How grey levels follow the light by a configuration or what it was taught with; auto if neither says it."""
-    said = config.says_response or config.taught is not None
-    return config.settings.monitor.corners.edges.response if said else "auto"
+    return config.settings.monitor.corners.edges.response if config.knows_response else "auto"
 
 
 def measure_again(

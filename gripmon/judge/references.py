@@ -161,11 +161,10 @@ class ReferenceBook:
     def _restore(self, earlier: ReferenceRecord, origin: str, stamp_ns: int) -> ReferenceRecord:
         if self.in_force.reference_id == earlier.reference_id:
             raise CommandRefused(f"{earlier.reference_id} is in force already, as revision {self.current.revision}")
-        return self._append(
-            self._next(
-                earlier.cam_T_grip, earlier.covariance, stamp_ns, origin, "operator", restores=earlier.reference_id
-            )
+        again = self._next(
+            earlier.cam_T_grip, earlier.covariance, stamp_ns, origin, "operator", restores=earlier.reference_id
         )
+        return self._append(msgspec.structs.replace(again, with_gripper=earlier.with_gripper))
 
     def _next(
         self,

@@ -1,4 +1,16 @@
-"""What the gripper file and the reference are off by in every frame alike, so that no frame tells."""
+"""What the gripper file and the reference are off by in every frame alike, so that no frame tells.
+
+Edges are taught where they show if the gripper stands at the reference.  Let that be off by e, the file exact: the
+offsets have e in them.  Every pose is off by e then, and after a motion so are the offsets by e's part of the motion.
+
+A file made of the same images as the reference has errors s of its size and t of its tilt, and the reference has them,
+too: together they show the fingers where the images have them, whatever s and t are.  So nothing of these is in the
+offsets, and the images at the reference don't tell them.  What they do is what the file's own do, taught or not: the
+pose is farther by s and turned by t, and of a motion the size is wrong by s, and what :class:`Tilt` has of t.  Counted
+from the reference's covariance, too, they would count twice, so that it counts without them
+(:func:`~gripmon.track.edges.taught.own_covariance`): its e is the scatter of the outline, across the line of sight.  A
+reference from elsewhere, a plate or hand-placed corners, has an e of its own, independent of s and t: both count.
+"""
 
 from __future__ import annotations
 

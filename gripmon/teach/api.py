@@ -32,7 +32,7 @@ from gripmon.teach.measure import teach as teach_images
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
-from gripmon.track.edges.taught import Provenance, TaughtImage, TaughtModel, identity
+from gripmon.track.edges.taught import Provenance, TaughtImage, TaughtModel, identity, own_covariance
 
 __all__ = ["Configured", "Teaching", "teach"]
 
@@ -84,7 +84,8 @@ class Teaching:
     @property
     def edges(self) -> TaughtEdges:
         """What was taught, as the monitor uses it."""
-        return TaughtEdges.of_model(self.model, self.config.gripper, self.config.reference.covariance)
+        gripper = self.config.gripper
+        return TaughtEdges.of_model(self.model, gripper, own_covariance(self.config.reference, gripper))
 
     def kept(self) -> tuple[Kept, Kept]:
         """What a monitor says over the images without what was taught, and with it."""

@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
-from gripmon.teach.inset import INSET_SIGMA_M
+from gripmon.teach.inset import INSET_SIGMA_M, made_from_images
 from gripmon.teach.lines import FEWEST_POINTS, SLOPE_SHARE, UNKNOWN_SLOPE, Line, PooledOffsets, pool, slopes
 from gripmon.teach.views import TAKE_MEASURED, SampledEdge, TeachingRefused, View, Viewer
 from gripmon.track.edges.roles import along_fingers
@@ -78,7 +78,7 @@ class _Measured:
     """Arrays of all edges with lines: ``indices`` (e,) in the gripper, ``outline`` (e,), ``ends_m`` one (s, 2) each,
     transferred to the mean jaw opening by the depths ``depth_m`` (e,) known so far; ``turned`` as in the viewer, one
     (s,) each; ``noise_m2`` (e, 2) variance of their means; ``rows`` (e, 2, 8) derivatives, metres by the unknowns of
-    the measurement and by an inset of all outlines.
+    the measurement and by an inset of all outlines, of a standard deviation ``inset_m``.
     """
 
     indices: list[int]
@@ -89,6 +89,7 @@ class _Measured:
     depth_m: Array
     noise_m2: Array
     rows: Array
+    inset_m: float
 
     @classmethod
     def of(cls, viewer: Viewer, lines: Mapping[int, EdgeLines], before: Mapping[str, TaughtEdge] | None) -> _Measured:
@@ -106,11 +107,12 @@ class _Measured:
         # Bevels and roundings shift all outlines towards the finger: common to them, like a motion.
         inset = np.repeat((viewer.inside[indices] * outline)[:, None, None], 2, axis=1)
         rows = np.concatenate([np.array([edge.sampled.rows for edge in edges]), inset], axis=2)
-        return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows)
+        inset_m = _inset_sigma_m(viewer, float(np.median(per_m)))
+        return cls(indices, edges, outline, ends_m, turned, depth_m, noise_m2, rows, inset_m)
 
     def pooled(self, motion_covariance: Array) -> PooledOffsets:
         """Pool all edges, with a prior (7, 7) of pose and opening."""
-        prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
+        prior = block_diag(motion_covariance, self.inset_m**2)
         return pool(
             self.means_m, self.noise_m2[:, :, None] * np.eye(2), self.rows, (~self.outline).astype(np.intp), prior
         )
@@ -119,6 +121,16 @@ class _Measured:
     def means_m(self) -> Array:
         """Mean ends (e, 2) over the images."""
         return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
+
+
+def _inset_sigma_m(viewer: Viewer, per_m: float) -> float:
+    """Standard deviation of an inset of all outlines, of ``per_m`` px per metre: by bevels; a file made of images has
+    its outlines where they show, but for what a whole edge's position is off by, as the response moves dark outlines.
+    """
+    if not made_from_images(viewer.gripper):
+        return INSET_SIGMA_M
+    off_px = viewer.rig.settings.corners.with_response(taught=False).consensus.edge_floor_px
+    return max(off_px / per_m, 1e-9)
 
 
 def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> PooledOffsets:
@@ -137,7 +149,7 @@ def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance:
         (measured.noise_m2[which][:, :, None] + PLAUSIBLE_OWN_M**2) * np.eye(2),
         measured.rows[which],
         np.zeros(len(which), dtype=np.intp),
-        block_diag(prior_covariance, INSET_SIGMA_M**2),
+        block_diag(prior_covariance, measured.inset_m**2),
     )
 
 
@@ -261,14 +273,14 @@ LOST_SHARE = 0.25
 
 
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
-    """Refuse if too little of the gripper, or of one finger, is seen: of what can be seen as lines, straight outlines
-    that are long enough for one.
+    """Refuse if too little of the gripper, or of one finger, is seen: of what can be seen as lines, outlines, straight
+    or nearly so, that are long enough for one.
     """
     profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
-    profiles = np.where(viewer.gripper.edge_curved | (profiles < FEWEST_POINTS * len(views)), 0, profiles)
+    profiles = np.where(viewer.bent | (profiles < FEWEST_POINTS * len(views)), 0, profiles)
     if not profiles.any():
         raise TeachingRefused(
-            "no outline in view is straight, and only straight edges are taught; the gripper file without teaching"
+            "no outline in view is nearly straight, and only such edges are taught; the gripper file without teaching"
         )
     seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
     share = seen.sum() / max(profiles.sum(), 1)

@@ -173,7 +173,7 @@ def gripper_from_images(
         gripper=gripper, notes=tuple(notes), lens=camera, cam_T_grip=cam_T_grip, covariance=covariance,
         opening_m=opening_m, corners=len(gripper.corner_ids), images=used, rms_px=rms_px,
         rms_m=rms_px * float(cam_T_grip[2, 3]) / camera.fx_px, outline_sigma_px=outline_px,
-        left_out=left_out, seen=seen, shown=shown,
+        left_out=left_out, seen=seen, shown=shown, with_gripper=reference is None, response=light.response,
     )  # fmt: skip
 
 

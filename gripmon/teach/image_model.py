@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
-from gripmon.model.gripper import EdgeModel, FingerModel, GripperModel, JawModel, PointModel
+from gripmon.model.gripper import WIDEST_BEVEL_M, EdgeModel, FingerModel, GripperModel, JawModel, PointModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 from gripmon.teach.curved_edges import smooth_curve
 from gripmon.teach.finger_depth import PlacedOutlines, leaves_smoothly, nearest_on_ray
 from gripmon.teach.image_motion import FingerMoved
-from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.image_outline import FingerSeen, OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
+from gripmon.teach.straight_pieces import jackknife_sigma
 from gripmon.teach.vanishing import PARALLEL_RAD, Outline
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
@@ -130,13 +131,16 @@ def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None,
             x, y, z = (round(float(v), 7) for v in local[k])
             corner = bool(outline.corner[k] and met[k] >= 2)
             points[f"{outline.name}_{k}"] = PointModel(finger=outline.name, xyz_m=(x, y, z), corner=corner)
+        spread_m = _spreads_m(seen, finger)
         for a, b in kept:
-            edges[f"{outline.name}_{a}_{b}"] = EdgeModel(start=f"{outline.name}_{a}", end=f"{outline.name}_{b}")
+            names = f"{outline.name}_{a}", f"{outline.name}_{b}"
+            edges[f"{outline.name}_{a}_{b}"] = EdgeModel(start=names[0], end=names[1], bevel_m=_width_m(spread_m[a, b]))
         for curve, via in zip(curves, vias, strict=True):
             first, last = (f"{outline.name}_{k}" for k in (curve[0][0], curve[-1][1]))
             via_m = ((via - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
             places_m = tuple((round(float(x), 7), round(float(y), 7), round(float(z), 7)) for x, y, z in via_m)
-            edges[f"{first}_{curve[-1][1]}"] = EdgeModel(start=first, end=last, via=places_m)
+            width_m = _width_m(float(np.sqrt(np.mean([spread_m[piece] ** 2 for piece in curve]))))
+            edges[f"{first}_{curve[-1][1]}"] = EdgeModel(start=first, end=last, via=places_m, bevel_m=width_m)
         for number, edge in enumerate(finger.inner):
             start = _starts_at(seen, outline, known, edge)
             ends = _inner_in_space(seen, outline, places, start, edge)
@@ -155,6 +159,25 @@ def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None,
         name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=seen.scale_sigma,
         tilt_sigma_rad=round(seen.placed.tilt_sigma_rad, 4), provenance=provenance,
     )  # fmt: skip
+
+
+def _spreads_m(seen: MeasuredGripper, finger: FingerSeen) -> dict[tuple[int, int], float]:
+    """Standard deviation of each piece of a finger's outline across itself, from the scatter over the images (m)."""
+    out: dict[tuple[int, int], float] = {}
+    first = 0
+    for chain in finger.chains:
+        for a, b in chain.pieces:
+            u, v = chain.uv_px[b] - chain.uv_px[a]
+            across_px = chain.folds_px[:, [a, b]] @ (np.array([-v, u]) / math.hypot(u, v))
+            sigma_px = float(np.sqrt(np.square(jackknife_sigma(across_px)).mean()))
+            out[first + a, first + b] = sigma_px / seen.camera.fx_px * seen.depth_m
+        first += len(chain.uv_px)
+    return out
+
+
+def _width_m(spread_m: float) -> float:
+    """Width within which an edge of a standard deviation lies evenly spread."""
+    return round(min(math.sqrt(12.0) * spread_m, WIDEST_BEVEL_M), 7)
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:

@@ -186,7 +186,7 @@ def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[in
     """Lines of all edges that some image samples, and why others have none; outlines are included without a line."""
     lines, untaught = {}, {}
     for edge in sorted({e for view in views for e in view.prediction.layout.edges.tolist()}):
-        if viewer.gripper.edge_curved[edge]:
+        if viewer.bent[edge]:
             untaught[viewer.gripper.edge_ids[edge]] = "it is curved"
             continue
         seen = sampled(views, edge)

@@ -15,6 +15,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.gripper import SIZE_UNKNOWN, Gripper, GripperModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
+from gripmon.model.response import Response
 from gripmon.model.yaml_text import in_one_line
 from gripmon.teach.drawing import draw_gripper
 from gripmon.track.edges.taught import gripper_digest
@@ -26,7 +27,9 @@ class GripperResult:
 
     Where the maker knows it, the gripper's pose before a camera ``lens``: ``cam_T_grip`` (4, 4), the ``covariance``
     (6, 6) of its error (position of the TCP, then rotation, camera axes; None: it is only a view), at the opening
-    ``opening_m`` of a moving jaw, from so many ``corners`` in so many ``images``, which fit to ``rms_px``, ``rms_m``.
+    ``opening_m`` of a moving jaw, from so many ``corners`` in so many ``images``, which fit to ``rms_px``, ``rms_m``;
+    ``with_gripper``: the gripper is made of the same images, whose errors of size and tilt both have, and which show
+    the camera's ``response``.
     """
 
     gripper: Gripper
@@ -39,6 +42,8 @@ class GripperResult:
     images: int = 1
     rms_px: float = 0.0
     rms_m: float = 0.0
+    with_gripper: bool = False
+    response: Response | None = None
 
     @property
     def model(self) -> GripperModel:
@@ -60,6 +65,8 @@ class GripperResult:
             cam_T_grip=to_record(self.cam_T_grip),
             covariance=tuple(self.covariance.ravel().tolist()),
             residuals=HandEyeResiduals(rms_m=self.rms_m, rms_px=self.rms_px, corners=self.corners, images=self.images),
+            with_gripper=self.with_gripper,
+            response=self.response,
             warnings=self.notes,
             provenance=provenance,
         )
@@ -132,7 +139,7 @@ _ABOUT = {
     "points": "x, y, z (m) at the nominal opening; `corner: true`: measured as a fingertip corner; `round`: on the "
     "outline of a part that is round about an axis",
     "edges": "between two points, straight, or curved through the points `via`; `kind`: where faces don't say; "
-    "`bevel_m`: width of a bevel (m)",
+    "`bevel_m`: width of a bevel, or of where the edge may lie (m)",
     "faces": "loops of points, counter-clockwise seen from outside; they decide what is visible",
     "jaw": "openings (m): smallest, largest, and the one at which the coordinates below hold",
     "scale_sigma": "standard deviation of a factor on all lengths; 1: the size is unknown",

@@ -64,6 +64,7 @@ from gripmon.teach.snapping import FEWEST_PUT, Snapper
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
+from gripmon.track.edges.taught import own_covariance
 
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
@@ -159,7 +160,7 @@ class Setup:
         """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
         found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
-        pose, covariance = from_record(reference.cam_T_grip), reference.covariance
+        pose, covariance = from_record(reference.cam_T_grip), own_covariance(reference, self.gripper)
         shown = found.reference_offset, found.reference_covariance
         return found, TaughtEdges.of(found.edges, self.gripper, pose, opening_m, covariance, *shown)
 

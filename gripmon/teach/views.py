@@ -34,6 +34,9 @@ _CLEAR_SHARE = 0.9  # inlier ratio where the gripper was expected; below it it i
 _DENSE = 4096  # search lines: as many as there are pixels along the edges
 REMEDIES = "images at the reference; or correct gripper file or jaw opening; or calibrate again"
 TAKE_MEASURED = f"{REMEDIES}, or take the measured pose"
+MOST_BEND_RAD = math.radians(30.0)
+"""Largest angle of an edge from the straight line between its ends with which it is taught: offsets across that line
+are taught, linear along the edge, of which cos 30 degrees, 87 %, is across the edge where it bends most."""
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 
@@ -90,9 +93,10 @@ class View:
 class Viewer:
     """Measures teaching images with one camera, gripper and reference.
 
-    ``crease`` (e,): which edges lie between two visible faces at the reference; ``inside`` (e,): the side of an edge on
-    which its finger lies (1: to the right when going along it, -1: to the left); ``turned`` (i, e): angle (rad) by
-    which the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold.
+    ``crease`` (e,): which edges lie between two visible faces at the reference; ``bent`` (e,): which are too curved to
+    be taught; ``inside`` (e,): the side of an edge on which its finger lies (1: to the right when going along it, -1:
+    to the left); ``turned`` (i, e): angle (rad) by which the line of sight to an edge differs between an image and the
+    mean jaw opening, for which the others hold.
     """
 
     def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
@@ -106,6 +110,7 @@ class Viewer:
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
         edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
         self.crease = edges.crease
+        self.bent: NDArray[np.bool_] = gripper.edge_bend_rad > MOST_BEND_RAD
         self.inside = finger_side(gripper, self.points_grip_m, self.ref_cam_T_grip, edges)
         _, depth = sight_axes(gripper, self.points_grip_m, self.ref_cam_T_grip)
         openings = [gripper.points_grip_m(image.jaw_opening_m) for image in images]
@@ -180,7 +185,7 @@ class Viewer:
         noise = estimate_noise(profiles, quantum(grey))
         candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), edges, zoom)
         per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
-        # Edges are straight: a sample's motion along its edge doesn't matter.
+        # Edges are nearly straight: a sample's motion along its edge doesn't matter.
         expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)
         sample = candidates.sample
         across = np.einsum("ni,ni->n", there.normal, here.normal)

@@ -15,15 +15,13 @@ from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.daemon.config.checks import (
     View,
-    configured,
-    covariance_of,
     jaw_fault,
     joined,
     monitor_fault,
     network_fault,
     order_fault,
     predict_view,
-    reference_transform,
+    reference_of,
     source_fault,
     view_fault,
 )
@@ -37,11 +35,11 @@ from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, Si
 from gripmon.io.wire import Joining
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
-from gripmon.model.geometry import from_record, to_record
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import TaughtEdges, TaughtModel
-from gripmon.track.edges.taught import mismatch
+from gripmon.track.edges.taught import mismatch, own_covariance
 
 if TYPE_CHECKING:
     from gripmon.simulate import Scenario
@@ -75,7 +73,14 @@ class Config:
     taught: TaughtModel | None = None
     calibrated: CalibrationFiles = field(default_factory=CalibrationFiles)
     says_response: bool = True
-    """Whether the file itself says ``monitor.corners.edges.response``; else a taught model does."""
+    """Whether the file itself says ``monitor.corners.edges.response``; else a taught model does, or the reference's
+    file.
+    """
+
+    @property
+    def knows_response(self) -> bool:
+        """Whether anything says how grey levels follow the light; else linear is assumed."""
+        return self.says_response or self.taught is not None or self.calibrated.response is not None
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
@@ -86,7 +91,8 @@ class Config:
         """
         if self.taught is None:
             return None
-        return TaughtEdges.of_model(self.taught, self.gripper, covariance_of(self.settings.reference))
+        reference = reference_of(self.settings.reference)
+        return TaughtEdges.of_model(self.taught, self.gripper, own_covariance(reference, self.gripper))
 
     @property
     def taught_path(self) -> Path | None:
@@ -158,6 +164,9 @@ def load_config(
     gripper = read_gripper(gripper_path)
     reference = _reference(path, settings, gripper, calibrated)
     said = "response" in _within(values, "monitor", "corners", "edges")
+    if not said and calibrated.response is not None:
+        monitor = settings.monitor.with_response(calibrated.response)
+        settings = msgspec.structs.replace(settings, monitor=monitor)
     config = Config(path, settings, camera, gripper, gripper_path, reference, None, calibrated, said)
     fault = (
         monitor_fault(settings.monitor)
@@ -229,11 +238,10 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
     if fault is not None:
         raise ConfigError.of(file, fault)
     try:
-        cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
+        return reference_of(settings.reference)
     except SettingsError as error:
         key = error.fault.key if file is path else error.fault.key.removeprefix("reference.")
         raise ConfigError.of(file, error.fault._replace(key=key)) from None
-    return configured(to_record(cam_T_grip), covariance, settings.reference.id)
 
 
 def _with_taught(config: Config) -> Config:

@@ -13,6 +13,7 @@ from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import named_file, read_document
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
+from gripmon.model.response import Response
 from gripmon.track.edges.taught import gripper_digest
 
 _INTRINSICS, _PLANE = "a file of gripmon calibrate intrinsics", "a file of gripmon calibrate plane"
@@ -26,6 +27,11 @@ class CalibrationFiles:
     paths: dict[str, Path] = field(default_factory=dict)
     hand_eye: HandEyeCalibration | None = None
 
+    @property
+    def response(self) -> Response | None:
+        """How grey levels follow the light, where the reference's images show it."""
+        return None if self.hand_eye is None else self.hand_eye.response
+
 
 def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], CalibrationFiles]:
     """The configuration's values with file names replaced by their sections.  Raises :class:`ConfigError`."""
@@ -36,7 +42,11 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
     if isinstance(values.get("reference"), str):
         paths["reference"] = named_file(path, "reference", values["reference"], _PLANE, _OR)
         hand_eye = read_document(paths["reference"], HandEyeCalibration)
-        values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
+        values["reference"] = {
+            "cam_T_grip": _as_read(hand_eye.cam_T_grip),
+            "covariance": list(hand_eye.covariance),
+            "with_gripper": hand_eye.with_gripper,
+        }
     return values, CalibrationFiles(paths, hand_eye)
 
 

@@ -32,7 +32,7 @@ from gripmon.io.sources.live import backend_number
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord, Transform, ValidBy, to_json
 from gripmon.monitor import MonitorSettings
@@ -148,10 +148,18 @@ def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
     return settings.covariance
 
 
-def configured(cam_T_grip: Transform, covariance: tuple[float, ...], name: str | None = None) -> ReferenceRecord:
+def configured(
+    cam_T_grip: Transform, covariance: tuple[float, ...], name: str | None = None, *, with_gripper: bool = False
+) -> ReferenceRecord:
     """A configuration's reference; without a name it is named by its transform."""
     name = name or f"config-{hashlib.sha256(to_json(cam_T_grip)).hexdigest()[:8]}"
-    return ReferenceRecord(name, 0, 0, "configuration", cam_T_grip, covariance)
+    return ReferenceRecord(name, 0, 0, "configuration", cam_T_grip, covariance, with_gripper=with_gripper)
+
+
+def reference_of(settings: ReferenceSettings) -> ReferenceRecord:
+    """The reference of a configuration's section.  Raises :class:`SettingsError` if it is invalid."""
+    cam_T_grip, covariance = to_record(reference_transform(settings)), covariance_of(settings)
+    return configured(cam_T_grip, covariance, settings.id, with_gripper=settings.with_gripper)
 
 
 def monitor_fault(settings: MonitorSettings) -> Fault | None:

@@ -80,6 +80,13 @@ class ReferenceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         ]
         | None
     ) = None
+    with_gripper: Annotated[
+        bool,
+        Meta(
+            description="the gripper file was made of the same images: what it and this reference are off by together, "
+            "in size and tilt, counts once"
+        ),
+    ] = False
 
 
 class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

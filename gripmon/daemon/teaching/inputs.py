@@ -190,7 +190,7 @@ def _calibrations(
         found = read_calibrated(reference_path)
         given = given or (None if found.lens is None else GivenCamera(found.lens))
         assert found.cam_T_grip is not None
-        reference = configured(found.cam_T_grip, found.covariance)
+        reference = configured(found.cam_T_grip, found.covariance, with_gripper=found.with_gripper)
         fault = None if given is None else mismatch(found.lens, found.gripper, given.lens, gripper)
         if fault is not None:
             wrong = fault.wrong.replace("the configuration's camera", "the one given")

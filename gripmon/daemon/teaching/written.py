@@ -116,6 +116,8 @@ def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> 
         *(f"      {', '.join(yaml_value(v) for v in covariance[6 * row : 6 * row + 6])}," for row in range(6)),
         "    ]",
     ]
+    if reference.with_gripper:
+        lines.append("  with_gripper: true  # made of the images of the gripper file: an error of both counts once")
     return "\n".join(lines)
 
 

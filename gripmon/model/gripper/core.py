@@ -70,6 +70,7 @@ class Gripper:
         through = [self._through(n, e, p) for (n, e), p in zip(model.edges.items(), self.edge_points, strict=True)]
         self._curves = Curves(through, self.edge_ids)
         self.edge_curved, self.has_curves = self._curves.curved, bool(self._curves.curved.any())
+        self.edge_bend_rad = self._curves.bend_rad
         at_corner = (self.edge_points[None] == self.corner_points[:, None, None]).any(axis=2)
         self._edges_at_corner = [np.flatnonzero(at_it & ~self.edge_curved) for at_it in at_corner]
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])

@@ -31,6 +31,11 @@ class Curves:
         self._bulges = {
             i: _bulge(points, names[i]) for i, points in enumerate(points_m) if points is not None
         }  # fmt: skip
+        self.bend_rad: Array = np.zeros(len(points_m))
+        """(e,) largest angle between an edge and the straight line between its two ends."""
+        for i, points in enumerate(points_m):
+            if points is not None:
+                self.bend_rad[i] = _bend_rad(self._bulges[i], points[-1] - points[0])
 
     def bulge_m(self, edge: NDArray[np.intp], fraction: Array) -> tuple[Array, Array]:
         """Offset (n, 3) from the straight line between the two ends at fractions (n,) of edges (n,), gripper frame, and
@@ -41,6 +46,14 @@ class Curves:
             own = np.flatnonzero(edge == i)
             bulge[own], rate[own] = spline(fraction[own]), spline(fraction[own], 1)
         return bulge, rate
+
+
+def _bend_rad(bulge: CubicSpline, chord_m: Array) -> float:
+    """Largest angle of the curve's tangents from its chord (3,), at places between its points."""
+    at = np.linspace(0.0, 1.0, 4 * len(bulge.x) + 1)
+    ways = chord_m + bulge(at, 1)
+    cosines = ways @ chord_m / (np.linalg.norm(ways, axis=1) * np.linalg.norm(chord_m))
+    return float(np.arccos(np.clip(cosines.min(), -1.0, 1.0)))
 
 
 def _bulge(points_m: Array, name: str) -> CubicSpline:

@@ -44,6 +44,13 @@ class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="grip
     inputs: Annotated[
         ReferenceInputs | None, Meta(description="what it was measured from; null if it was not measured here")
     ] = None
+    with_gripper: Annotated[
+        bool,
+        Meta(
+            description="whether the gripper file was made of the same images, so that its wrong size or tilt is this "
+            "pose's, too: one error, not two"
+        ),
+    ] = False
 
 
 class StripsRecord(msgspec.Struct, frozen=True):

@@ -29,7 +29,7 @@ from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.gripper.core import POLARITY
-from gripmon.model.records import Array, Transform
+from gripmon.model.records import Array, ReferenceRecord, Transform
 from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
@@ -107,6 +107,9 @@ class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     seen: Annotated[float, Meta(ge=0.0, le=1.0, description="part of its search lines that showed it")] = 1.0
     left: Look | None = None
     right: Look | None = None
+
+
+_UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
 
 
 class TaughtCorner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -206,10 +209,10 @@ class TaughtEdges:
     ``sigma_m`` (e,): its standard deviation across the line of sight; ``depth_grip`` (e, 3): the line of sight when
     taught, across the edge; ``depth_sigma_m`` (e,): the standard deviation along it; ``polarity`` (e,): int8 as in the
     gripper (1: brighter to the right); ``shown`` (e,): part of it that showed.  An edge that isn't known has no shift,
-    and is expected to show.  ``usual_m``: root mean square offset of
-    the taught edges, which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught
-    at, which their offsets have in them: one standard deviation along each of k directions, m and rad, given both the
-    reference's own covariance and what the teaching images show of where the gripper was.
+    and is expected to show.  ``usual_m`` (e,): root mean square offset of the taught edges of its kind that were seen,
+    which others may have, too.  ``reference_error`` (k, 6): of the reference that they were taught at, which their
+    offsets have in them: one standard deviation along each of k directions, m and rad, given both the reference's own
+    covariance and what the teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
     poses are off by as much if the camera moved since the calibration.
     """
@@ -223,7 +226,7 @@ class TaughtEdges:
     depth_sigma_m: Array
     polarity: NDArray[np.int8]
     shown: Array
-    usual_m: float
+    usual_m: Array
     reference_error: Array
     reference_offset: Array
 
@@ -238,13 +241,14 @@ class TaughtEdges:
         offset: Sequence[float] = (0.0,) * 6,
         images_covariance: Sequence[float] | None = None,
     ) -> TaughtEdges:
-        """Arrays of edges taught at a pose and a jaw opening; ``covariance``: of the pose, 6 x 6 row by row; None where
-        it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of which
-        ``images_covariance`` says as above how well they show it, None if not at all.
+        """Arrays of edges taught at a pose and a jaw opening; ``covariance``: :func:`own_covariance` of the pose; None
+        where it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of
+        which ``images_covariance`` says as above how well they show it, None if not at all.
         """
-        untaught = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
-        listed = [edges.get(name, untaught) for name in gripper.edge_ids]
-        across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
+        listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
+        points_grip_m = gripper.points_grip_m(jaw_opening_m)
+        across, depth = sight_axes(gripper, points_grip_m, cam_T_grip)
+        crease = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3]).crease
         share = np.array([e.share for e in listed])
         offset_m = np.array([e.offset_m for e in listed])
         slope_m = (offset_m[:, 1] - offset_m[:, 0]) / (share[:, 1] - share[:, 0])
@@ -260,7 +264,7 @@ class TaughtEdges:
             np.array([e.depth_sigma_m for e in listed]),
             np.array([POLARITY[e.brighter] for e in listed], dtype=np.int8),
             np.array([e.seen for e in listed]),
-            float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
+            _usual_m(listed, crease),
             np.zeros((0, 6)) if covariance is None else _error(covariance, images_covariance),
             np.array(offset),
         )
@@ -294,13 +298,43 @@ class TaughtEdges:
         return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
 
 
+def _usual_m(edges: Sequence[TaughtEdge], crease: NDArray[np.bool_]) -> Array:
+    """(e,) root mean square offset of the taught ``edges`` (e,) that were seen, for outlines that of outlines, for
+    others, by ``crease`` (e,), that of creases, or of all where there is none of the kind; 0 without any.
+    """
+    seen = [edge for edge in edges if edge is not _UNTAUGHT and edge.seen > 0.0]
+    out = np.zeros(len(edges))
+    for kind in (False, True) if seen else ():
+        same = [edge.offset_m for edge in seen if edge.crease == kind] or [edge.offset_m for edge in seen]
+        out[crease == kind] = np.sqrt(np.mean(np.square(same)))
+    return out
+
+
+def own_covariance(reference: ReferenceRecord, gripper: Gripper) -> tuple[float, ...]:
+    """(36,) covariance of what a reference is off by besides the gripper file's errors, row by row.
+
+    Made of the same images as the file, it is off by these errors: a size, along the line of sight, and a tilt, which
+    the file states itself.
+    """
+    if not reference.with_gripper:
+        return reference.covariance
+    kept = np.eye(6)
+    if gripper.model.scale_sigma:
+        at_m = np.array(reference.cam_T_grip.translation_m)
+        kept[:3, :3] -= np.outer(at_m, at_m) / float(at_m @ at_m)
+    if gripper.model.tilt_sigma_rad:
+        kept[3:, 3:] = 0.0
+    own = kept @ np.reshape(reference.covariance, (6, 6)) @ kept.T
+    return tuple(own.ravel().tolist())
+
+
 def _error(covariance: Sequence[float], images_covariance: Sequence[float] | None) -> Array:
     """(6, 6) one standard deviation along each of six directions of a pose of which two things tell, independently."""
     both = np.reshape(covariance, (6, 6))
     if images_covariance is not None:
         both = both - both @ np.linalg.solve(both + np.reshape(images_covariance, (6, 6)), both)
-        both = 0.5 * (both + both.T)
-    return np.asarray(np.linalg.cholesky(both).T)
+    variances, directions = np.linalg.eigh(0.5 * (both + both.T))
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0))[:, None] * directions.T)
 
 
 def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tuple[Array, Array]:
