@@ -57,6 +57,7 @@ from gripmon.monitor.answers import (
 )
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.shadow import Shadow
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
@@ -75,16 +76,19 @@ class Monitor:
         taught: TaughtEdges | None = None,
         state: MonitorState | None = None,
         keep: Keep = lambda _: "",
+        shadow: bool = False,
     ):
         """``state``: of :meth:`state` before a restart; its newest reference counts then.
         ``keep`` is called before any other reference comes into force: one that can't be kept is only proposed, or
         refused.
+        ``shadow``: the belief is asked beside the rules, for benchmarks.
 
         Raises ValueError for an inconsistent state.
         """
         self._camera, self._gripper, self._settings = camera, gripper, settings
         # Taught offsets belong to the gripper's edges: a new reference doesn't change them.
         self._tracker = Tracker(camera, gripper, settings, taught)
+        self.shadow = Shadow(camera, gripper, self._tracker, reference, settings) if shadow else None
         self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
         self._average = PoseAverage(settings.smoothing)
         self._notes = NoteTaker(settings)
@@ -186,6 +190,8 @@ class Monitor:
         # Where the gripper is, and by how much that may be off.
         before_T, rivals = self._cam_T_grip, self._trust.rivals(self._ref_cam_T_grip)
         self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
+        if self.shadow is not None:
+            self.shadow.see(frame, self._newest, self._now_s)
         standing = self._trust.judge(frame, self._newest, self._now_s)
         if standing is None:
             explanation = self._analysis.explain(frame, self._newest, wrong=True, usual=False, now_s=self._now_s)
