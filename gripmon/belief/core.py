@@ -16,7 +16,7 @@ import numpy as np
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
 from gripmon.belief.keep import keep, remember
-from gripmon.belief.nodes import Nodes, prepare
+from gripmon.belief.nodes import Nodes, lie_across, prepare
 from gripmon.belief.rows import add_noise, fade, move
 from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search
 from gripmon.belief.state import (
@@ -131,12 +131,13 @@ class Belief:
         self._onsets = Onsets(self._table)
         self._jumps = Jumps.of(self.priors, along)
         self._edges, self._fingers = len(doubts[0].edges), len(doubts[0].ends)
-        self._sizes = np.square([self.priors.near_px, self.priors.far_px])
+        p = self.priors
+        self._sizes = np.array([p.near_px**2, p.far_px**2, p.another, p.aligned])
         self._everything, self._searching = everything, searching
         kept = _MOST_CANDIDATES if everything else most + 1
         listed = kept if everything else kept + _MOST_LISTED
         self._bank, self._other = (Bank.empty(listed, self._edges, backgrounds) for _ in range(2))
-        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges)
+        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges, len(doubts))
         self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
         self._bank.covariance[0] = self.priors.covariance() if covariance is None else covariance
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
@@ -256,6 +257,7 @@ class Belief:
         nodes.parent[i], nodes.jump[i], nodes.before[i] = h, jump, before
         doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
         prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
+        lie_across(nodes, i, self._bank, asked.seen, self._table, self._sizes)
 
     def _keep(self, n: int, asked: Asked) -> float:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates

@@ -13,7 +13,7 @@ import numpy as np
 
 from gripmon.belief.core import Belief, Believed
 from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
-from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Priors, Seen
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Priors, Seen
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
@@ -71,8 +71,8 @@ class Shadow:
             for finger in range(len(gripper.finger_ids))
         ]
         self._belief = Belief(
-            doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors, risk=settings.policy.integrity_risk, most=most,
-            covariance=covariance,
+            doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors,
+            risk=settings.policy.integrity_risk, most=most, covariance=covariance,
         )  # fmt: skip
         self._beside: _Beside | None = None
         self._last_s: float | None = None
@@ -177,7 +177,7 @@ class Shadow:
             likes.append(_alike(now, then, beside.noise))
         return min(likes)
 
-    def _remember(self, beside: _Beside, shown: Array) -> None:
+    def _remember(self, beside: _Beside, shown: Flags) -> None:
         if self._beside is None:
             self._beside = beside
             return
@@ -185,7 +185,7 @@ class Shadow:
         self._beside = _Beside(grey, beside.noise)
 
 
-def doubts_of(gripper: Gripper, along: Array, ends_of: list[Array]) -> list[Doubt]:
+def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
     """What may be wrong with a gripper's edges."""
     edges, fingers = len(gripper.edge_ids), len(gripper.finger_ids)
     out = of_edges(edges, fingers) + of_ends(ends_of)
