@@ -130,9 +130,9 @@ class Shadow:
         edge_of = p.layout.edge[c.sample]
         for edge in measurement.normal.edge:
             own = np.flatnonzero((edge_of == edge) & (fit.weight > 0.0))
-            if len(own) < FEWEST_POINTS or not fit.edge_seen[edge]:
-                continue
             sample = c.sample[own]
+            if len(np.unique(sample)) < FEWEST_POINTS or not fit.edge_seen[edge]:
+                continue
             line = _line(p.layout.fraction[sample], 1.0 / np.square(c.sigma_px[own]))
             both = line @ np.column_stack([c.offset_px[own], from_reference[sample], at[sample]])
             left = c.offset_px[own] - _basis(p.layout.fraction[sample]) @ both[:, 0]
