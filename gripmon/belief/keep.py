@@ -14,6 +14,11 @@ from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
+REST = 10.0
+"""What is left together is dropped when it is less probable than this many of the lightest that are kept: a hundredth of
+the risk.
+"""
+
 
 @compiled
 def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: Array, covariance: Array) -> None:
@@ -80,11 +85,13 @@ def keep(
         total += math.exp(candidates.log_weight[c] - top)
     chosen, listed, lost = np.empty(min(most, n), np.int64), 0, 0.0
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
+    rest = 1.0
     for c in order:
         weight = math.exp(candidates.log_weight[c] - top) / total
-        if weight < least or (listed == len(into.doubts) and not merging):
+        if weight < least or (merging and listed > 0 and rest < REST * least):
             lost += weight
             continue
+        rest -= weight
         i, doubts = candidates.node[c], candidates.doubts[c]
         for j in range(SIZE):
             mean[j] = bank.mean[nodes.parent[i], j]

@@ -1,8 +1,7 @@
 """Which sets of doubts explain a frame: the search that decides whether a bound can be trusted.
 
 From every hypothesis, and from what it finds, it goes on to the sets with one doubt more or less, each weighed exactly;
-without it one frame in seven is beyond its bound, at any risk (``tools/bench belief --sample --search-off``).
-Compiled.
+without it what begins later is never doubted.  Compiled.
 """
 
 from __future__ import annotations
