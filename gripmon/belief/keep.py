@@ -15,7 +15,7 @@ from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
 REST = 10.0
-"""What is left together is dropped when it is less probable than this many of the lightest that are kept: a hundredth of
+"""What is left is dropped when all of it is less probable than this many of the lightest that are kept: a hundredth of
 the risk.
 """
 

@@ -81,6 +81,11 @@ class Shadow:
         self._hidden = False
         self.newest: Believed | None = None
 
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the motion since the reference, over all hypotheses."""
+        return self._belief.moments[1][MOTION, MOTION]
+
     def see(self, frame: Frame, measurement: Measurement, now_s: float) -> None:
         """A frame of the monitor's, measured."""
         self.newest = None
