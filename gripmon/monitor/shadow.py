@@ -146,7 +146,7 @@ class Shadow:
             measured[edge], searched[edge], rows[edge] = both[:, 0] + both[:, 1], both[:, 1], both[:, 2:]
             white[edge] = LEAST_WHITE_PX**2 + spread * np.array([1.0, 3.0]) / independent
             step = float(np.median(np.abs(c.step[own])))
-            texture = _texture(beside, int(edge))
+            texture = _texture(beside.grey, int(edge), beside.noise)
             strength[edge] = (TEXTURE_PX * texture / max(step, 1.0)) ** 2 / independent
             rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(np.median(c.step[own])), 0.0
             shown[edge] = True
@@ -238,14 +238,14 @@ def _beside(image: Image, measurement: Measurement, edges: int) -> _Beside:
     return _Beside(grey, measurement.candidates.noise / math.sqrt(3.0))
 
 
-def _texture(beside: _Beside, edge: int) -> float:
+def _texture(grey: Array, edge: int, noise: float) -> float:
     """Scatter of the grey levels along the more uneven side of an edge, without noise and shading."""
     most = 0.0
     ways = np.linspace(-1.0, 1.0, BESIDE_POINTS)
-    for side in beside.grey[edge]:
+    for side in grey[edge]:
         if np.isfinite(side).all():
             left = side - np.polyval(np.polyfit(ways, side, 1), ways)
-            most = max(most, float(left @ left) / (BESIDE_POINTS - 2) - beside.noise**2)
+            most = max(most, float(left @ left) / (BESIDE_POINTS - 2) - noise**2)
     return math.sqrt(most)
 
 
