@@ -6,6 +6,7 @@ A pure function of the frames so far: no clock, no I/O, no threads.  Time is the
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -57,11 +58,13 @@ from gripmon.monitor.answers import (
 )
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.shadow import Shadow
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.track.edges import Measurement, TaughtEdges, trace_of
+
+if TYPE_CHECKING:
+    from gripmon.monitor.shadow import Shadow
 
 
 class Monitor:
@@ -88,7 +91,7 @@ class Monitor:
         self._camera, self._gripper, self._settings = camera, gripper, settings
         # Taught offsets belong to the gripper's edges: a new reference doesn't change them.
         self._tracker = Tracker(camera, gripper, settings, taught)
-        self.shadow = Shadow(camera, gripper, self._tracker, reference, settings) if shadow else None
+        self.shadow = self._shadowed_by_belief(camera, reference) if shadow else None
         self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
         self._average = PoseAverage(settings.smoothing)
         self._notes = NoteTaker(settings)
@@ -114,6 +117,11 @@ class Monitor:
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
             self._analysis.watch.resume(moved=self._policy.drifting)
+
+    def _shadowed_by_belief(self, camera: Camera, reference: ReferenceRecord) -> Shadow:
+        from gripmon.monitor.shadow import Shadow  # which no other run loads, or compiles
+
+        return Shadow(camera, self._gripper, self._tracker, reference, self._settings)
 
     @property
     def reference(self) -> ReferenceRecord:
