@@ -82,7 +82,7 @@ def test_a_longer_lens_and_brighter_light_move_edges_as_their_columns_say() -> N
         shift = other.measured[both, 0] - plain.measured[both, 0]
         wanted = by * plain.rows[both, 0, column]
         assert np.abs(wanted).max() > 0.5
-        assert shift == pytest.approx(wanted, abs=0.08 if column == FOCAL else 0.45)  # a square spreads slanted ones more
+        assert shift == pytest.approx(wanted, abs=0.08 if column == FOCAL else 0.45)  # a square spreads more
 
 
 def test_only_ends_tell_of_lengths() -> None:
