@@ -16,7 +16,7 @@ import numpy as np
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
 from gripmon.belief.keep import keep, remember
-from gripmon.belief.nodes import Nodes, prepare
+from gripmon.belief.nodes import Nodes, lie_across, prepare
 from gripmon.belief.rows import add_noise, fade, move
 from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search
 from gripmon.belief.state import (
@@ -40,6 +40,8 @@ GUARD = 20.0
 NOT_KNOWN_WEIGHT = 0.1
 """Of the hypothesis that the pose isn't known, while the guard stops: policy."""
 _MOST_CANDIDATES = 4096
+_MOST_LISTED = 256
+"""Hypotheses of one frame that count in its bound and don't go on."""
 
 
 class Bound(NamedTuple):
@@ -113,6 +115,7 @@ class Jumps(NamedTuple):
 class Belief:
     """Of one gripper with e edges.  ``along`` (3,): the fingers' direction in camera axes; ``risk`` of each of position
     and rotation together; at most ``most`` hypotheses are kept, and ``backgrounds`` remembered per edge.
+    ``covariance`` (23, 23) of g at the reference, where it isn't that of the priors.
     ``everything``: all sets of doubts are weighed and none is merged or dropped, for tests with few doubts.
     ``searching`` False leaves the search out, which a test shows to be wrong.
     """
@@ -120,6 +123,7 @@ class Belief:
     def __init__(
         self, doubts: Sequence[Doubt], along: Array, priors: Priors | None = None, *, risk: float = 1e-5,
         most: int = 64, backgrounds: int = 1, everything: bool = False, searching: bool = True,
+        covariance: Array | None = None,
     ) -> None:  # fmt: skip
         self.priors, self.risk, self.most = priors or Priors(), risk, most
         self.least = risk * 1e-3
@@ -127,15 +131,18 @@ class Belief:
         self._onsets = Onsets(self._table)
         self._jumps = Jumps.of(self.priors, along)
         self._edges, self._fingers = len(doubts[0].edges), len(doubts[0].ends)
-        self._sizes = np.square([self.priors.near_px, self.priors.far_px])
+        p = self.priors
+        self._sizes = np.array([p.near_px**2, p.far_px**2, p.another, p.aligned])
         self._everything, self._searching = everything, searching
         kept = _MOST_CANDIDATES if everything else most + 1
-        self._bank, self._other = (Bank.empty(kept, self._edges, backgrounds) for _ in range(2))
-        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges)
+        listed = kept if everything else kept + _MOST_LISTED
+        self._bank, self._other = (Bank.empty(listed, self._edges, backgrounds) for _ in range(2))
+        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges, len(doubts))
         self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
-        self._bank.covariance[0] = self.priors.covariance()
+        self._bank.covariance[0] = self.priors.covariance() if covariance is None else covariance
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
-        self._hypotheses, self._first, self._lost = 1, True, False
+        self._hypotheses = self._listed = 1
+        self._first, self._lost = True, False
         self._began = np.zeros(1, bool)  # of each hypothesis: all ends are doubted since the last frame
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
@@ -158,18 +165,20 @@ class Belief:
         return mean, np.einsum("h,hij->ij", weights, self._bank.covariance[:n]) + (weights[:, None] * away).T @ away
 
     def update(
-        self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0, hidden_knock: float = 0.0
-    ) -> Believed:
+        self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0,
+        hidden_knock: float = 0.0, opening_m: float = 0.0,
+    ) -> Believed:  # fmt: skip
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
-        0. ``hidden_knock``: probability of a knock that is due in this frame because no end is shown (policy; once for
-        each such stretch), beside that of the rate; hypotheses that begin to doubt all ends have it in any
-        case.  Raises ValueError unless time goes on.
+        0. ``opening_m``: standard deviation of what the reported opening's error has changed by.  ``hidden_knock``:
+        probability of a knock that is due in this frame because no end is shown (policy; once for each such stretch),
+        beside that of the rate; hypotheses that begin to doubt all ends have it in any case.  Raises ValueError unless
+        time goes on.
         """
         first = self._first
         if not dt_s > 0.0:
             raise ValueError(f"dt_s = {dt_s}: frames follow each other in time")
         if not first:
-            self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY))
+            self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY), opening_m)
         for h in range(self._hypotheses):
             fade(self._bank, h, seen)
         told = told or nothing_told(self._fingers)
@@ -187,12 +196,12 @@ class Belief:
                 self._not_known()
         return self._believed(dropped, surprise)
 
-    def _predict(self, dt_s: float, light: float) -> None:
+    def _predict(self, dt_s: float, light: float, opening_m: float) -> None:
         priors, root_dt = self.priors, math.sqrt(dt_s)
-        rows = np.zeros((7, SIZE))
+        rows = np.zeros((8, SIZE))
         rows[range(6), range(6)] = np.repeat([priors.creep_m_s * root_dt, priors.creep_rad_s * root_dt], 3)
-        rows[6, LIGHT] = priors.light_px * math.sqrt(1.0 - light * light)
-        factor = rows if light < 1.0 else rows[:6]
+        rows[6, LIGHT], rows[7, OPENING] = priors.light_px * math.sqrt(1.0 - light * light), opening_m
+        factor = rows[rows.any(axis=1)]
         lag = min(1.0 - math.exp(-dt_s / LATELY_S), MOST_LAG)
         for h in range(self._hypotheses):
             move(self._bank, h, lag, light)
@@ -231,10 +240,10 @@ class Belief:
             hope = max(float(candidates.surprise[h]), 0.0)
             due = hidden_knock + (self.priors.unseen_knock if self._began[h] else 0.0)
             for j in range(len(jumps.share)):
-                chance = 1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
+                chance = jumps.share[j] * (1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s))
                 if chance <= 0.0:
                     continue
-                log = math.log(jumps.share[j] * chance)
+                log = math.log(chance)
                 if stayed[h] + hope + log < best - least:
                     continue
                 factor = jumps.factors[j, : jumps.ranks[j]]
@@ -248,12 +257,13 @@ class Belief:
         nodes.parent[i], nodes.jump[i], nodes.before[i] = h, jump, before
         doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
         prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
+        lie_across(nodes, i, self._bank, asked.seen, self._table, self._sizes)
 
     def _keep(self, n: int, asked: Asked) -> float:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates
         most, least = (min(n, len(bank.doubts)), 0.0) if self._everything else (self.most, self.least)
         merging = not self._everything
-        chosen, dropped = keep(candidates, n, nodes, bank, other, asked.seen, self._table, most, least, merging)
+        chosen, listed, dropped = keep(candidates, n, nodes, bank, other, asked.seen, self._table, most, least, merging)
         parents = nodes.parent[candidates.node[chosen]]
         for old, new in zip(bank[4:], other[4:], strict=True):
             new[: len(chosen)] = old[parents]
@@ -263,7 +273,7 @@ class Belief:
         )
         unseen, before = (of & self._table.all_ends != 0 for of in (other.doubts[: len(chosen)], bank.doubts[parents]))
         self._began = unseen & ~before
-        self._bank, self._other, self._hypotheses = other, bank, len(chosen)
+        self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
         return float(dropped)
 
     def _not_known(self) -> None:
@@ -278,11 +288,11 @@ class Belief:
         add_noise(bank, n, bank.mean[n], bank.covariance[n], widest)
         bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
         bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
-        self._hypotheses = n + 1
+        self._hypotheses = self._listed = n + 1
         self._began = np.append(self._began[:n], False)
 
     def _believed(self, dropped: float, surprise: float) -> Believed:
-        bank, n, mean = self._bank, self._hypotheses, np.empty(SIZE)
+        bank, n, mean = self._bank, self._listed, np.empty(SIZE)
         bounds.place(bank, n, mean)
         self._dropped, self._mean = dropped, mean
         return Believed(mean[MOTION], mean[REFERENCE], self.bound(self.risk), dropped, surprise, not self._lost)
@@ -291,7 +301,7 @@ class Belief:
         """Of the last frame, at another risk; that of the filter is the smallest for which enough is kept."""
         left = 0.0 if self._lost else 0.5 * risk - self._dropped
         floors = (bounds.SPLIT_M, bounds.SPLIT_RAD) * 2
-        of = (self._bank, self._hypotheses, self._mean)
+        of = (self._bank, self._listed, self._mean)
         return Bound(*(float(bounds.bound(*of, a, f, left)) for a, f in zip(_BOUNDED, floors, strict=True)))
 
 

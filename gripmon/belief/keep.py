@@ -14,6 +14,11 @@ from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
+REST = 10.0
+"""What is left is dropped when all of it is less probable than this many of the lightest that are kept: a hundredth of
+the risk.
+"""
+
 
 @compiled
 def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: Array, covariance: Array) -> None:
@@ -68,51 +73,53 @@ def same_doubts(one: int, other: int, table: Table) -> bool:
 def keep(
     candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int,
     least: float, merging: bool,
-) -> tuple[Ints, float]:  # fmt: skip
-    """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, at most ``most``, none lighter than
-    ``least``, by moments where two are the same (``merging``); which candidate gives each its rows (k,), and the
-    probability that was dropped.
+) -> tuple[Ints, int, float]:  # fmt: skip
+    """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, none lighter than ``least``, by
+    moments where two are the same (``merging``).  At most ``most`` go on: beyond these what says the same of the place
+    is one of them whatever it doubts, and what says something else is listed behind them, for this frame's bound alone.
+    Which candidate gives each its rows (k,), how many are listed, and the probability that is in none.
     """
     order = np.argsort(-candidates.log_weight[:n])
     top, total = candidates.log_weight[order[0]], 0.0
     for c in order:
         total += math.exp(candidates.log_weight[c] - top)
-    chosen, k, lost = np.empty(min(most, n), np.int64), 0, 0.0
+    chosen, listed, lost = np.empty(min(most, n), np.int64), 0, 0.0
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
+    rest = 1.0
     for c in order:
         weight = math.exp(candidates.log_weight[c] - top) / total
-        i, doubts = candidates.node[c], candidates.doubts[c]
-        new, alike = k < most and weight >= least, False
-        for q in range(k if merging else 0):
-            alike = alike or same_doubts(into.doubts[q], doubts, table)
-        if not new and not alike:
+        if weight < least or (merging and listed > 0 and rest < REST * least):
             lost += weight
             continue
+        rest -= weight
+        i, doubts = candidates.node[c], candidates.doubts[c]
         for j in range(SIZE):
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
         posterior(nodes, i, seen, doubted, held, mean, covariance)
         twin = -1
-        for q in range(k if merging else 0):
-            if not same_doubts(into.doubts[q], doubts, table):
+        for q in range(listed if merging else 0):
+            if listed < most and not same_doubts(into.doubts[q], doubts, table):
                 continue
             if same_place(into.mean[q], into.covariance[q], mean, covariance):
                 twin = q
                 break
         if twin >= 0:
             merge(into, twin, weight, mean, covariance)
-        elif new:
-            chosen[k], into.doubts[k], into.log_weight[k] = c, doubts, weight
+        elif listed < len(into.doubts):
+            if listed < most:
+                chosen[listed] = c
+            into.doubts[listed], into.log_weight[listed] = doubts, weight
             for j in range(SIZE):
-                into.mean[k, j] = mean[j]
+                into.mean[listed, j] = mean[j]
                 for m in range(SIZE):
-                    into.covariance[k, j, m] = covariance[j, m]
-            k += 1
+                    into.covariance[listed, j, m] = covariance[j, m]
+            listed += 1
         else:
             lost += weight
-    for q in range(k):
+    for q in range(listed):
         into.log_weight[q] = math.log(into.log_weight[q] / (1.0 - lost))
-    return chosen[:k], lost
+    return chosen[:min(most, listed)], listed, lost
 
 
 @compiled

@@ -15,17 +15,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.belief.rows import backward, foreign, forward, gains, root_of, shift_row
-from gripmon.belief.state import SIZE, Bank, Ints, Seen
+from gripmon.belief.doubts import Table
+from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, root_of, shift_row
+from gripmon.belief.state import LENGTHS, SIZE, Bank, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
+
+_FIRST = LENGTHS.start
 
 
 class Nodes(NamedTuple):
     """n nodes: a hypothesis (``parent`` (n,)) that jumped (``jump`` (n,), -1 for none) before the frame, with log
     weight ``before`` (n,).  ``root`` L (n, 23, 23); whitened ``rows`` w (n, e, 2, 23) and ``missing`` zeta (n, e, 2);
     ``base`` (n, e), what of an edge's log likelihood depends on no set; ``free`` and ``held`` (n, e), its log
-    likelihood as another thing's; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown.
+    likelihood as another thing's; ``across`` (n, d), by how much that of each doubt's edges together is larger since a
+    straight thing may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown.
     """
 
     parent: Ints
@@ -37,17 +41,18 @@ class Nodes(NamedTuple):
     base: Array
     free: Array
     held: Array
+    across: Array
     information: Array
     pull: Array
 
     @classmethod
-    def empty(cls, nodes: int, edges: int) -> Nodes:
+    def empty(cls, nodes: int, edges: int, doubts: int) -> Nodes:
         """Zeros."""
         n, e = nodes, edges
         return cls(
             np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros((n, SIZE, SIZE)),
             np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
-            np.zeros((n, SIZE, SIZE)), np.zeros((n, SIZE)),
+            np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)), np.zeros((n, SIZE)),
         )  # fmt: skip
 
 
@@ -104,6 +109,57 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
             nodes.missing[i, edge, row] = zeta
             nodes.base[i, edge] -= 0.5 * math.log(2.0 * math.pi * variance)
             add_row(information, pull, white, zeta, 1.0)
+
+
+@compiled
+def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes: Array) -> None:
+    """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
+    fingers were longer or shorter by one length, far or near, each but for an edge's width.
+    """
+    near, far, another, share = sizes[0], sizes[1], sizes[2], sizes[3]
+    before = bank.doubts[nodes.parent[i]]
+    for k in range(len(table.edges)):
+        nodes.across[i, k] = 0.0
+        of_ends = False
+        for finger in range(len(table.ends)):
+            of_ends = of_ends or (table.ends[finger] >> k) & 1 == 1
+        if not of_ends:
+            continue
+        log, apart, squares, cross, along, rows = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        most = 0.0
+        for edge in range(len(seen.shown)):
+            if (table.edges[k] >> edge) & 1 and seen.shown[edge]:
+                for row in range(2):
+                    most = max(most, abs(seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]))
+        for edge in range(len(seen.shown)):
+            if not ((table.edges[k] >> edge) & 1 and seen.shown[edge]):
+                continue
+            apart += nodes.held[i, edge]
+            for row in range(2):
+                way = (seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]) / most
+                missing = seen.measured[edge, row] - seen.searched[edge, row]
+                variance = near + seen.strength[edge] + seen.white[edge, row]
+                log -= 0.5 * math.log(2.0 * math.pi * variance)
+                squares += missing * missing / variance
+                cross += way * missing / variance
+                along += way * way / variance
+                rows += 1
+        if rows < 4 or most == 0.0:
+            continue
+        log -= 0.5 * (squares - far * cross * cross / (1.0 + far * along)) + 0.5 * math.log(1.0 + far * along)
+        share_now = share if (before >> k) & 1 == 0 else another * share
+        if share_now > 0.0:
+            nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + log - apart)
+
+
+@compiled
+def across(nodes: Nodes, i: int, doubts: int) -> float:
+    """The largest of what a set's doubts add."""
+    most = 0.0
+    for k in range(nodes.across.shape[1]):
+        if (doubts >> k) & 1 and (most == 0.0 or nodes.across[i, k] > most):
+            most = nodes.across[i, k]
+    return most
 
 
 @compiled

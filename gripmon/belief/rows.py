@@ -201,8 +201,25 @@ def log_sum(a: float, b: float) -> float:
 
 
 @compiled
+def drawn(place: Array, spread: Array, missing: float, white: float) -> float:
+    """Log likelihood of one row, ``missing`` px from where it was searched, whose ``place`` (2,) (place, background)
+    with its variances and covariance ``spread`` (3,) learns from it.
+    """
+    missing -= place[0] + place[1]
+    variance = spread[0] + 2.0 * spread[1] + spread[2] + white
+    of_place, of_back = (spread[0] + spread[1]) / variance, (spread[1] + spread[2]) / variance
+    place[0] += of_place * missing
+    place[1] += of_back * missing
+    spread[0] -= of_place * of_place * variance
+    spread[1] -= of_place * of_back * variance
+    spread[2] -= of_back * of_back * variance
+    return -0.5 * (missing * missing / variance + math.log(2.0 * math.pi * variance))
+
+
+@compiled
 def foreign(bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, keep: bool) -> float:
-    """Log likelihood of an edge that is another thing's, by ``sizes`` (2,), variances of near and far, px^2.
+    """Log likelihood of an edge that is another thing's, by ``sizes`` (3,): variances of near and far, px^2, and the
+    probability that the search finds another line of that thing than before, or that it has moved.
 
     It lies anywhere around where it was searched, and stays there while the picture does; ``held`` moves with the
     gripper and stays in any case.  ``fresh``: the doubt begins.  ``keep``: it is learnt, and what wasn't shown fades.
@@ -210,36 +227,32 @@ def foreign(bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, 
     shown, strength = seen.shown[edge], seen.strength[edge]
     like = seen.likeness[edge] if shown else 1.0
     stays = 1.0 if held or like >= STILL else like
-    logs = np.empty(FOREIGN_KINDS)
+    another = 1.0 if fresh else sizes[2] if shown else 0.0
+    logs, place, spread = np.empty(FOREIGN_KINDS), np.zeros((2, 2, 2)), np.zeros((2, 2, 3))  # it stays, or is drawn
     for kind in range(FOREIGN_KINDS):
-        logs[kind] = -math.log(2.0) if fresh else bank.kind[h, edge, kind]
+        stay, draw = math.log(max(1.0 - another, 1e-300)), math.log(max(another, 1e-300))
         for row in range(2):
-            place, back = bank.place[h, edge, kind, row, 0], bank.place[h, edge, kind, row, 1]
-            pp, pb = bank.place_spread[h, edge, kind, row, 0], bank.place_spread[h, edge, kind, row, 1]
-            bb = bank.place_spread[h, edge, kind, row, 2]
-            at = bank.searched[h, edge, row]
-            if fresh:
-                place, back, pp, pb, bb, at = 0.0, 0.0, sizes[kind], 0.0, strength, seen.searched[edge, row]
-            else:
-                place, back = stays * place, like * back
-                pp = stays * stays * pp + (1.0 - stays * stays) * sizes[kind]
-                pb, bb = stays * like * pb, like * like * bb + (1.0 - like * like) * strength
+            was = bank.place_spread[h, edge, kind, row]
+            place[0, row, 0] = stays * bank.place[h, edge, kind, row, 0]
+            place[0, row, 1] = like * bank.place[h, edge, kind, row, 1]
+            spread[0, row, 0] = stays * stays * was[0] + (1.0 - stays * stays) * sizes[kind]
+            spread[0, row, 1] = stays * like * was[1]
+            spread[0, row, 2] = like * like * was[2] + (1.0 - like * like) * strength
+            place[1, row, 0], place[1, row, 1] = 0.0, 0.0
+            spread[1, row, 0], spread[1, row, 1], spread[1, row, 2] = sizes[kind], 0.0, strength
             if shown:
-                missing = seen.measured[edge, row] - at - place - back
-                variance = pp + 2.0 * pb + bb + seen.white[edge, row]
-                logs[kind] -= 0.5 * (missing * missing / variance + math.log(2.0 * math.pi * variance))
-                of_place, of_back = (pp + pb) / variance, (pb + bb) / variance
-                place, back = place + of_place * missing, back + of_back * missing
-                pp, pb, bb = (
-                    pp - of_place * of_place * variance,
-                    pb - of_place * of_back * variance,
-                    bb - of_back * of_back * variance,
-                )
-            if keep:
-                bank.searched[h, edge, row] = at
-                bank.place[h, edge, kind, row, 0], bank.place[h, edge, kind, row, 1] = place, back
-                bank.place_spread[h, edge, kind, row, 0], bank.place_spread[h, edge, kind, row, 1] = pp, pb
-                bank.place_spread[h, edge, kind, row, 2] = bb
+                at, white = seen.measured[edge, row], seen.white[edge, row]
+                stay += drawn(place[0, row], spread[0, row], at - bank.searched[h, edge, kind, row], white)
+                draw += drawn(place[1, row], spread[1, row], at - seen.searched[edge, row], white)
+        way = 0 if stay >= draw else 1
+        logs[kind] = (-math.log(2.0) if fresh else bank.kind[h, edge, kind]) + log_sum(stay, draw)
+        for row in range(2 if keep else 0):
+            if way == 1:
+                bank.searched[h, edge, kind, row] = seen.searched[edge, row]
+            for k in range(2):
+                bank.place[h, edge, kind, row, k] = place[way, row, k]
+            for k in range(3):
+                bank.place_spread[h, edge, kind, row, k] = spread[way, row, k]
     total = log_sum(logs[0], logs[1])
     if keep:
         for kind in range(FOREIGN_KINDS):

@@ -1,8 +1,7 @@
 """Which sets of doubts explain a frame: the search that decides whether a bound can be trusted.
 
 From every hypothesis, and from what it finds, it goes on to the sets with one doubt more or less, each weighed exactly;
-without it one frame in seven is beyond its bound, at any risk (``tools/bench belief --sample --search-off``).
-Compiled.
+without it what begins later is never doubted.  Compiled.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief.doubts import Chances, Table, Told, edges_of, log_told, log_transition
-from gripmon.belief.nodes import Nodes, weigh, without
+from gripmon.belief.nodes import Nodes, across, weigh, without
 from gripmon.belief.state import SIZE, Bank, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
@@ -73,7 +72,7 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
     log, surprise = weigh(
         nodes, i, asked.seen, edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges), root, solution
     )
-    log += nodes.before[i] + log_transition(before, doubts, asked.chances)
+    log += nodes.before[i] + log_transition(before, doubts, asked.chances) + across(nodes, i, doubts)
     candidates.node[n], candidates.doubts[n] = i, doubts
     candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first)
     candidates.surprise[n], candidates.expanded[n] = surprise, False
@@ -109,6 +108,7 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     covered, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
     log, _ = weigh(nodes, i, seen, covered, held, root, solution)
+    log += across(nodes, i, doubts)
     candidates.expanded[c] = True
     for k in range(len(table.edges)):
         changed = doubts ^ (1 << k)

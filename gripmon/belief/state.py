@@ -57,11 +57,13 @@ class Priors:
     Of the reference's error b (6,), m and rad; of the jaw opening and the finger lengths, m; of the light, px; of the
     focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is
     for good.  ``near_px`` and ``far_px``: where another thing's edge is found, by the width of an edge and by the reach
-    of the search.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.  ``small_per_s``:
-    how often it moves by ``small_m``, ``small_rad`` an axis.  ``knock_per_s``: one knock a month, of log-normal size,
-    median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``: standard deviation and share) in 2 of 3, else along the
-    fingers.  ``unseen_knock``: its probability each time that all ends begin to be doubted (policy: what hides them is
-    what knocks).  ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``.
+    of the search; ``another``: probability that the next search finds another one of that thing; ``aligned``: share of
+    what lies over fingers' ends that is straight across them.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
+    in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis.
+    ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
+    standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability each time that
+    all ends begin to be doubted (policy: what hides them is what knocks).  ``opening_per_s``: the reported opening is
+    wrong by ``opening_jump_m``.
     """
 
     reference: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2)
@@ -72,6 +74,8 @@ class Priors:
     lasting_px: float = 0.05
     near_px: float = 0.5
     far_px: float = 7.0
+    another: float = 0.01
+    aligned: float = 0.5
     creep_m_s: float = 3e-6
     creep_rad_s: float = 3e-5
     small_per_s: float = 0.02
@@ -96,9 +100,9 @@ class Priors:
 class Bank(NamedTuple):
     """h hypotheses of e edges (2 e rows), k - 1 remembered backgrounds: ``log_weight`` (h,), ``doubts`` (h,) as bits;
     ``mean`` (h, 23) and ``covariance`` (h, 23, 23) of g; each row's u given g: ``offset`` a (h, 2 e, k), ``slope`` A
-    (h, 2 e, k, 23), ``spread`` C (h, 2 e, k, k), px.  Of doubted edges ``searched`` (h, e, 2), px, where they were
-    looked for when the doubt began; by kind (near, far) its log share ``kind`` (h, e, 2), and of each row (place,
-    background) the ``place`` (h, e, 2, 2, 2) and its variances and covariance ``place_spread`` (h, e, 2, 2, 3).
+    (h, 2 e, k, 23), ``spread`` C (h, 2 e, k, k), px.  Of doubted edges by kind (near, far) its log share ``kind`` (h,
+    e, 2), where each row was ``searched`` (h, e, 2, 2), px, when its place was drawn, and the ``place`` (h, e, 2, 2, 2)
+    beside that (place, background) with variances and covariance ``place_spread`` (h, e, 2, 2, 3).
     """
 
     log_weight: Array
@@ -120,7 +124,7 @@ class Bank(NamedTuple):
         return cls(
             np.zeros(h), np.zeros(h, np.int64), np.zeros((h, SIZE)), np.zeros((h, SIZE, SIZE)),
             np.zeros((h, 2 * e, k)), np.zeros((h, 2 * e, k, SIZE)), np.zeros((h, 2 * e, k, k)),
-            np.zeros((h, e, 2)), np.zeros((h, e, 2)), np.zeros((h, e, 2, 2, 2)), np.zeros((h, e, 2, 2, 3)),
+            np.zeros((h, e, 2, 2)), np.zeros((h, e, 2)), np.zeros((h, e, 2, 2, 2)), np.zeros((h, e, 2, 2, 3)),
         )  # fmt: skip
 
 

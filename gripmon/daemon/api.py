@@ -33,13 +33,17 @@ from gripmon.model.response import likely_linear
 class Monitor(monitor.Monitor):
     """The per-frame method with a configuration: frames in, records out, nothing else."""
 
-    def __init__(self, config: Config, state: MonitorState | None = None, keep: Keep = lambda _: "") -> None:
-        """``state`` and ``keep``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for an inconsistent state.
+    def __init__(
+        self, config: Config, state: MonitorState | None = None, keep: Keep = lambda _: "", shadow: bool = False
+    ) -> None:
+        """``state``, ``keep`` and ``shadow``: see :class:`gripmon.monitor.Monitor`.  Raises ValueError for an
+        inconsistent state.
         The very first frame on a machine takes a minute, in which the per-frame code is compiled, unless
         :func:`gripmon.monitor.warm_up` has done so before, in all cores.
         """
+        settings = config.settings.monitor
         super().__init__(
-            config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, state, keep
+            config.camera, config.gripper, settings, config.reference, config.taught_edges, state, keep, shadow
         )
         self._config = config
         self._has_jaw = config.gripper.has_jaw

@@ -6,6 +6,7 @@ A pure function of the frames so far: no clock, no I/O, no threads.  Time is the
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -62,6 +63,9 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.track.edges import Measurement, TaughtEdges, trace_of
 
+if TYPE_CHECKING:
+    from gripmon.monitor.shadow import Shadow
+
 
 class Monitor:
     """Watches one camera on one gripper, starting from a reference calibration."""
@@ -75,16 +79,19 @@ class Monitor:
         taught: TaughtEdges | None = None,
         state: MonitorState | None = None,
         keep: Keep = lambda _: "",
+        shadow: bool = False,
     ):
         """``state``: of :meth:`state` before a restart; its newest reference counts then.
         ``keep`` is called before any other reference comes into force: one that can't be kept is only proposed, or
         refused.
+        ``shadow``: the belief is asked beside the rules, for benchmarks.
 
         Raises ValueError for an inconsistent state.
         """
         self._camera, self._gripper, self._settings = camera, gripper, settings
         # Taught offsets belong to the gripper's edges: a new reference doesn't change them.
         self._tracker = Tracker(camera, gripper, settings, taught)
+        self.shadow = self._shadowed_by_belief(camera, reference) if shadow else None
         self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
         self._average = PoseAverage(settings.smoothing)
         self._notes = NoteTaker(settings)
@@ -110,6 +117,11 @@ class Monitor:
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
             self._analysis.watch.resume(moved=self._policy.drifting)
+
+    def _shadowed_by_belief(self, camera: Camera, reference: ReferenceRecord) -> Shadow:
+        from gripmon.monitor.shadow import Shadow  # which no other run loads, or compiles
+
+        return Shadow(camera, self._gripper, self._tracker, reference, self._settings)
 
     @property
     def reference(self) -> ReferenceRecord:
@@ -186,6 +198,8 @@ class Monitor:
         # Where the gripper is, and by how much that may be off.
         before_T, rivals = self._cam_T_grip, self._trust.rivals(self._ref_cam_T_grip)
         self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
+        if self.shadow is not None:
+            self.shadow.see(frame, self._newest, self._now_s)
         standing = self._trust.judge(frame, self._newest, self._now_s)
         if standing is None:
             explanation = self._analysis.explain(frame, self._newest, wrong=True, usual=False, now_s=self._now_s)

@@ -168,6 +168,11 @@ def handle(arguments: argparse.Namespace) -> int:
     setup = Setup(most=arguments.most, searching=not arguments.search_off)
     print(f"seed {arguments.seed}, {FRAMES} frames a run, at most {arguments.most} hypotheses\n")
     worlds = {"own": (), "second": SECOND, **{name: (name,) for name in SECOND}}
+    if arguments.witnesses:
+        from benchmarks.belief_witnesses import measured, table
+
+        print(table(measured(arguments.seed, 96)))
+        return 0
     if arguments.sensitivity:
         print(HEAD)
         for name in VARIED:
@@ -194,8 +199,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--most", type=int, default=64, help="hypotheses kept (default 64)")
     parser.add_argument("--world", choices=("own", "second", *SECOND), default="own")
-    parser.add_argument("--search-off", action="store_true", help="without the search: has to fail")
+    parser.add_argument("--search-off", action="store_true", help="without the search")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--sample", action="store_true", help="the risk of a world, by strata")
     what.add_argument("--sensitivity", action="store_true", help="priors times 3 and by 3, in the belief alone")
+    what.add_argument("--witnesses", action="store_true", help="what fingers' ends answer at right and at wrong places")
     parser.set_defaults(handler=handle)

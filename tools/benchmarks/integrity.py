@@ -98,9 +98,10 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--valid-by",
-        choices=("reference", "absolute"),
+        choices=("reference", "absolute", "belief"),
         default="",
-        help="which bound makes a transform valid (default: the product's); by the reference both are judged",
+        help="which bound makes a transform valid (default: the product's); by the reference both are judged; "
+        "belief: what the belief says beside the rules",
     )
     parser.add_argument(
         "--against",

@@ -24,6 +24,7 @@ from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.outline_seen import outline_seen
 from benchmarks.rendered import Rendered
+from gripmon.belief.core import Believed
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy.judging import NO_REFERENCE
 from gripmon.model.camera import Camera
@@ -49,6 +50,8 @@ from gripmon.simulate.scenario import Bump
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""
 _WHOLE = 0.995
+BELIEF = "belief"
+"""Instead of a bound's name: what the belief says beside the rules is judged, by the motion since the reference."""
 _CONFIRMED_FRAMES = 3
 _BENT_MM = 0.05
 _LIT = (0.15, 3.0)  # exposures between which an image isn't black or white
@@ -121,10 +124,12 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
     else:
         watched = _simulated(make_integrity_scene(_BY_NAME[name], seed, number, frames))
     settings = _settings(watched)
-    if valid_by:
+    if valid_by not in ("", BELIEF):
         policy = msgspec.structs.replace(settings.policy, valid_by=msgspec.convert(valid_by, ValidBy))
         settings = msgspec.structs.replace(settings, policy=policy)
-    monitor = Monitor(watched.camera, watched.gripper, settings, _reference(watched), None)
+    monitor = Monitor(
+        watched.camera, watched.gripper, settings, _reference(watched), None, shadow=valid_by == BELIEF
+    )
     truth = Truth(watched.start_cam_T_grip, watched.true_start_cam_T_grip)
     rows: list[dict[str, Any]] = []
     alerts: list[list[Any]] = []
@@ -132,7 +137,10 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
     grey_dn = None
     for index, look in enumerate(watched.looks):
         record = monitor.process(look.frame)
-        rows.append(_judged(record, look, truth, settings.policy.integrity_risk))
+        row = _judged(record, look, truth, settings.policy.integrity_risk)
+        if monitor.shadow is not None:
+            row |= _believed(monitor.shadow.newest, look, truth, watched.limits)
+        rows.append(row)
         alerts += [[index, alert.text] for alert in record.alerts if is_false(alert, watched.wrong)]
         moved += [index for alert in record.alerts if names_a_move(alert)]
         grey_dn = _grey_dn(look.frame) if grey_dn is None else grey_dn
@@ -144,7 +152,7 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
         "commit": commit(),
         "grey_dn": grey_dn,
         **_setting(watched, settings),
-        "valid_by": str(getattr(record, "valid_by", "absolute")),
+        "valid_by": valid_by if valid_by == BELIEF else str(getattr(record, "valid_by", "absolute")),
         "false_alerts": alerts,
         "moved_alerts": moved,
         "seconds": round(time.perf_counter() - start_s, 2),
@@ -260,6 +268,29 @@ def _judged(record: FrameRecord, look: Look, truth: Truth, risk: float) -> dict[
         out["level_m"] = _short(record.protection.position_m)
         out["level_rad"] = _short(record.protection.rotation_rad)
         out["why"] = record.protection.hypothesis
+    return out
+
+
+def _believed(believed: Believed | None, look: Look, truth: Truth, limits: AlertLimits) -> dict[str, Any]:
+    """The columns of :func:`_judged` by the belief: its motion since the reference against the true one."""
+    out: dict[str, Any] = dict.fromkeys(
+        ("error_m", "error_rad", "level_m", "level_rad", "floor_m", "nees", "absolute_error_m", "reference_m",
+         "reference_rad", "absolute_m", "absolute_rad")
+    )  # fmt: skip
+    out |= {"valid": False, "why": "", "reason": ""}
+    if believed is None or not believed.known:
+        return out
+    true_motion = perturbation_between(truth.true_start_cam_T_grip, look.cam_T_grip)
+    true_place = perturbation_between(truth.reference_cam_T_grip, look.cam_T_grip)
+    error, bound = believed.motion - true_motion, believed.bound
+    place = believed.motion + believed.reference_error - true_place
+    out["error_m"], out["error_rad"] = _short(np.linalg.norm(error[:3])), _short(np.linalg.norm(error[3:]))
+    out["absolute_error_m"] = _short(np.linalg.norm(place[:3]))
+    if math.isfinite(bound.position_m):
+        out["level_m"] = out["reference_m"] = _short(bound.position_m)
+        out["level_rad"] = out["reference_rad"] = _short(bound.rotation_rad)
+        out["absolute_m"], out["absolute_rad"] = _short(bound.absolute_m), _short(bound.absolute_rad)
+        out["valid"] = bound.position_m <= limits.position_m and bound.rotation_rad <= limits.rotation_rad
     return out
 
 

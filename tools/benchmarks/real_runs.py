@@ -7,8 +7,9 @@ another revision: ``python -P -m benchmarks.real_runs NAME=LIMIT_M,LIMIT_RAD=FOL
 from __future__ import annotations
 
 import csv
+import importlib.util
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -17,10 +18,13 @@ import msgspec
 import yaml
 
 import gripmon
+from gripmon.model.geometry import from_record, perturb, to_record
 from gripmon.model.images import image_paths
-from gripmon.model.records import FrameRecord, Protection, Verdict
+from gripmon.model.records import Frame, FrameRecord, Protection, Verdict
 
 CONFIG = "config.yaml"
+BELIEF = "belief"
+"""In a bound's place: the motion since the reference by the belief beside the rules."""
 _STAMPS = "timestamps.csv"
 _EVERY = slice(None)
 _HALVES = {"even": (slice(0, None, 2), slice(1, None, 2)), "odd": (slice(1, None, 2), slice(0, None, 2))}
@@ -90,7 +94,9 @@ def bound_names() -> tuple[str, ...]:
     """The bounds that ``valid`` can be decided by, in this gripmon."""
     from gripmon.judge.policy import PolicySettings
 
-    return ("reference", "absolute") if "valid_by" in PolicySettings.__struct_fields__ else ("absolute",)
+    if "valid_by" not in PolicySettings.__struct_fields__:
+        return ("absolute",)
+    return ("reference", "absolute", *([BELIEF] if importlib.util.find_spec("gripmon.monitor.shadow") else []))
 
 
 def bound_of(record: FrameRecord) -> Protection | None:
@@ -157,7 +163,7 @@ class _Project:
         policy = {**(monitor.get("policy") or {}), "alert_limit_m": self.limit.position_m}
         policy["alert_limit_rad"] = self.limit.rotation_rad
         if len(bound_names()) > 1:
-            policy["valid_by"] = bound
+            policy["valid_by"] = "reference" if bound == BELIEF else bound
         values: dict[str, Any] = {**self._values, "monitor": {**monitor, "policy": policy}}
         if taught is not None:
             values["taught"] = taught.name
@@ -169,8 +175,11 @@ class _Project:
         """The stills one after another; ``promised``: those that ``check`` has."""
         images, config = self._images[judged], self.config(bound, taught)
         with gripmon.open_source(self._stills(images), fps=1.0 / self._apart_s) as source:
-            stills = tuple(_still(record) for record in gripmon.replay(source, config))
-        proposed_m, proposed_rad = proposed_by_check(config, self._stills(self._images[promised]))
+            judged_by = _believed if bound == BELIEF else _decided
+            stills = tuple(judged_by(source, config))
+        proposed_m = proposed_rad = None
+        if bound != BELIEF:
+            proposed_m, proposed_rad = proposed_by_check(config, self._stills(self._images[promised]))
         names = tuple(path.name for path in images)
         return Part(names, uncounted, stills=stills, proposed_m=proposed_m, proposed_rad=proposed_rad)
 
@@ -248,6 +257,30 @@ def _still(record: FrameRecord) -> Still:
         record.reason,
         tuple(alert.kind.value for alert in record.alerts if alert.event.value == "raised"),
     )
+
+
+def _decided(source: Iterable[Frame], config: gripmon.Config) -> Iterator[Still]:
+    """Stills by the rules."""
+    return map(_still, gripmon.replay(source, config))
+
+
+def _believed(source: Iterable[Frame], config: gripmon.Config) -> Iterator[Still]:
+    """Stills by the belief."""
+    monitor, policy = gripmon.Monitor(config, shadow=True), config.settings.monitor.policy
+    shadow = monitor.shadow
+    assert shadow is not None
+    for frame in source:
+        record, believed = monitor.process(frame), shadow.newest
+        if believed is None or not believed.known:
+            yield Still(record.name, False, False, None, None, None, None, None, "", record.reason, ())
+            continue
+        bound = believed.bound
+        pose = to_record(perturb(from_record(monitor.reference.cam_T_grip), believed.motion))
+        valid = bound.position_m <= policy.alert_limit_m and bound.rotation_rad <= policy.alert_limit_rad
+        yield Still(
+            record.name, True, valid, pose.translation_m, pose.rotation_xyzw, tuple(shadow.covariance.ravel().tolist()),
+            bound.position_m, bound.rotation_rad, "", None, (),
+        )  # fmt: skip
 
 
 def main(arguments: Sequence[str]) -> None:

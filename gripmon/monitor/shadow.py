@@ -1,0 +1,261 @@
+"""The belief beside the rules: what it says of the frames that a monitor measures.  Nothing else listens to it.
+
+Each edge of the frame's fit is reduced to two numbers, where its own line lies at the middle of what is seen and how it
+is turned, with the pixels that stand beside it; the belief does the rest (:mod:`gripmon.belief`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.belief.core import Belief, Believed
+from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Priors, Seen
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturbation_between
+from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
+from gripmon.track.edges.profiles import read_profiles
+
+FEWEST_POINTS = 6
+"""Points of an edge from which it has an offset and a slope with a scatter."""
+LEAST_WHITE_PX = 0.02
+"""Standard deviation of an edge that no pixel noise explains: interpolation between pixels."""
+BESIDE_PX, BESIDE_POINTS = 6.0, 12
+"""Distance from an edge of the pixels beside it that are compared, clear of its blur, and how many a side."""
+TEXTURE_PX = 0.34 * math.sqrt(40.0)
+"""Background's error of an edge of one profile over its texture by contrast, px (simulated: blur 1 px, texture of 2 px;
+0.34 with 40 profiles).
+"""
+STILL_NOISES = 1.5
+"""Difference of two pictures, in units of what their noise makes of it, up to which nothing has changed."""
+LIKE_STILL, MOST_LIKE = 0.999, 0.98
+RIGHT, WRONG = np.log([0.05, 0.25, 0.70]), np.log([0.62, 0.36, 0.02])
+"""Log probability of 0, 1 or 2 indications of a finger's end, where it is one and where it is something else."""
+REPEATS = 0.95
+"""Probability that an answer about ends only repeats that of the frame before, at 15 frames/s."""
+
+
+class _Beside(NamedTuple):
+    """Grey levels (e, 2, p) to both sides of the edges; NaN of those that weren't seen."""
+
+    grey: Array
+    noise: float
+
+
+class Shadow:
+    """Of one monitor.  ``newest`` is what the belief says of the frame, None while none was measured."""
+
+    def __init__(
+        self, camera: Camera, gripper: Gripper, tracker: Tracker, reference: ReferenceRecord,
+        settings: MonitorSettings, most: int = 64,
+    ) -> None:  # fmt: skip
+        self._camera, self._gripper, self._tracker = camera, gripper, tracker
+        self._ref_T = from_record(reference.cam_T_grip)
+        self._jaw_sigma_m = settings.jaw_sigma_m
+        self._axis = self._ref_T[:3, :3] @ tracker.finger_axis
+        priors = Priors() if self._axis.any() else Priors(along_share=0.0)
+        covariance = priors.covariance()
+        covariance[REFERENCE, REFERENCE] = np.reshape(reference.covariance, (6, 6))
+        covariance[OPENING, OPENING] = max(math.hypot(settings.jaw_sigma_m, settings.jaw_offset_sigma_m), 1e-6) ** 2
+        covariance[LENGTHS, LENGTHS] = np.eye(2) * max(tracker.model_sigma_m, 1e-6) ** 2
+        self._ends_of = [
+            edges_at_ends(gripper) & ~tracker.along & (gripper.edge_finger == finger)
+            for finger in range(len(gripper.finger_ids))
+        ]
+        self._belief = Belief(
+            doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors,
+            risk=settings.policy.integrity_risk, most=most, covariance=covariance,
+        )  # fmt: skip
+        self._beside: _Beside | None = None
+        self._last_s: float | None = None
+        self._jaw_m: float | None = None
+        self._answer = np.full(len(self._ends_of), -1)
+        self._hidden = False
+        self.newest: Believed | None = None
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the motion since the reference, over all hypotheses."""
+        return self._belief.moments[1][MOTION, MOTION]
+
+    def see(self, frame: Frame, measurement: Measurement, now_s: float) -> None:
+        """A frame of the monitor's, measured."""
+        self.newest = None
+        seen = self._seen(frame, measurement)
+        if seen is None or (self._last_s is not None and now_s <= self._last_s):
+            return
+        ends = self._tracker.ends(frame, measurement)
+        ends_shown = bool(np.any([seen.shown & own for own in self._ends_of]))
+        hidden, self._hidden = not ends_shown and not self._hidden, not ends_shown
+        dt_s = 1.0 if self._last_s is None else now_s - self._last_s
+        due = self._belief.priors.unseen_knock if hidden else 0.0
+        self.newest = self._belief.update(
+            seen, dt_s, self._told(ends), hidden_knock=due, opening_m=self._opening_noise_m(frame)
+        )
+        self._last_s = now_s
+
+    def _opening_noise_m(self, frame: Frame) -> float:
+        """What the error of the reported opening changes by: renewed as the jaws move."""
+        before, self._jaw_m = self._jaw_m, frame.jaw_opening_m
+        if not self._gripper.has_jaw or self._jaw_sigma_m == 0.0:
+            return 0.0
+        if frame.jaw_opening_m is None or before is None:
+            return JAW_UNREPORTED_SIGMA_M if frame.jaw_opening_m is None else 0.0
+        kept = math.exp(-abs(frame.jaw_opening_m - before) / (2.0 * self._jaw_sigma_m))
+        return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
+
+    def _told(self, ends: FingerEndsSeen) -> Told:
+        """Of fingers whose ends are out of view, nothing."""
+        answer = np.where(ends.might > 0, np.minimum(ends.seen, 2), -1)
+        right, wrong = (np.where(answer >= 0, logs[answer], 0.0) for logs in (RIGHT, WRONG))
+        repeats, self._answer = (answer == self._answer) & (answer >= 0), answer
+        return Told(right, wrong, repeats, REPEATS)
+
+    def _seen(self, frame: Frame, measurement: Measurement) -> Seen | None:
+        """The frame's edges; None with too few of them."""
+        p, c, fit = measurement.prediction, measurement.candidates, measurement.consensus
+        edges = len(self._gripper.edge_ids)
+        rows, measured, white = np.zeros((edges, 2, SIZE)), np.zeros((edges, 2)), np.ones((edges, 2))
+        searched, shown = np.zeros((edges, 2)), np.zeros(edges, bool)
+        strength = np.full(edges, 1.0)
+        assert isinstance(frame.image, np.ndarray)
+        beside = _beside(frame.image, measurement, edges)
+        at = self._columns(measurement)
+        away = perturbation_between(self._ref_T, p.cam_T_grip)
+        reported_m = self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
+        from_reference = at[:, MOTION] @ away + at[:, OPENING] * (p.jaw_opening_m - reported_m)
+        edge_of = p.layout.edge[c.sample]
+        for edge in measurement.normal.edge:
+            own = np.flatnonzero((edge_of == edge) & (fit.weight > 0.0))
+            sample = c.sample[own]
+            if len(np.unique(sample)) < FEWEST_POINTS or not fit.edge_seen[edge]:
+                continue
+            line = _line(p.layout.fraction[sample], 1.0 / np.square(c.sigma_px[own]))
+            both = line @ np.column_stack([c.offset_px[own], from_reference[sample], at[sample]])
+            left = c.offset_px[own] - _basis(p.layout.fraction[sample]) @ both[:, 0]
+            spread = float(left @ left) / (len(own) - 2)
+            independent = max(float(p.independence[edge]) * len(own), 2.0)
+            measured[edge], searched[edge], rows[edge] = both[:, 0] + both[:, 1], both[:, 1], both[:, 2:]
+            white[edge] = LEAST_WHITE_PX**2 + spread * np.array([1.0, 3.0]) / independent
+            step = float(np.median(np.abs(c.step[own])))
+            texture = _texture(beside.grey, int(edge), beside.noise)
+            strength[edge] = (TEXTURE_PX * texture / max(step, 1.0)) ** 2 / independent
+            rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(np.median(c.step[own])), 0.0
+            shown[edge] = True
+        if np.count_nonzero(shown) < 3:
+            return None
+        likeness = np.array([self._likeness(beside, e) if shown[e] else 0.0 for e in range(edges)])
+        self._remember(beside, shown)
+        return Seen(rows, measured, white, shown, np.zeros(edges, np.int64), likeness, strength, searched)
+
+    def _columns(self, measurement: Measurement) -> Array:
+        """(n, 23): how each search line's offset changes with g, at the present pose."""
+        p = measurement.prediction
+        out = np.zeros((len(p.uv_px), SIZE))
+        out[:, MOTION] = out[:, REFERENCE] = p.jacobian[:, :6]
+        if p.jacobian.shape[1] > 6:
+            out[:, OPENING] = p.jacobian[:, 6]
+        along = p.jacobian[:, :3] @ (p.cam_T_grip[:3, :3] @ self._tracker.finger_axis)
+        for finger, ends in enumerate(self._ends_of[:2]):
+            out[:, LENGTHS.start + finger] = np.where(ends[p.layout.edge], along, 0.0)
+        camera = self._camera
+        centre = np.array([camera.cx_px, camera.cy_px])
+        out[:, FOCAL] = np.einsum("ni,ni->n", p.normal, p.uv_px - centre)
+        return out
+
+    def _likeness(self, beside: _Beside, edge: int) -> float:
+        """How like the pixels beside an edge are to when it was seen last: of the side that changed more."""
+        if self._beside is None:
+            return 0.0
+        likes = []
+        for now, then in zip(beside.grey[edge], self._beside.grey[edge], strict=True):
+            if not np.isfinite(now).all() or not np.isfinite(then).all():
+                return 0.0
+            likes.append(_alike(now, then, beside.noise))
+        return min(likes)
+
+    def _remember(self, beside: _Beside, shown: Flags) -> None:
+        if self._beside is None:
+            self._beside = beside
+            return
+        grey = np.where(shown[:, None, None], beside.grey, self._beside.grey)
+        self._beside = _Beside(grey, beside.noise)
+
+
+def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
+    """What may be wrong with a gripper's edges."""
+    edges, fingers = len(gripper.edge_ids), len(gripper.finger_ids)
+    out = of_edges(edges, fingers) + of_ends(ends_of)
+    inner = inner_edges(gripper)
+    nobody = np.zeros(fingers, bool)
+    groups = [(inner & along, GROUP), (inner, GROUP), *((side, GROUP) for side in sides(gripper))]
+    if fingers > 1:
+        groups += [(gripper.edge_finger == f, FINGER) for f in range(fingers)]
+    taken = {d.edges.tobytes() for d in out[:edges]}
+    for flags, rates in groups:
+        if 1 < flags.sum() < edges and flags.tobytes() not in taken:
+            taken.add(flags.tobytes())
+            out.append(Doubt(np.asarray(flags, bool), rates, nobody))
+    return out
+
+
+def _basis(fraction: Array) -> Array:
+    """(n, 2): one, and the way along what is seen of an edge, -1 to 1."""
+    middle, half = 0.5 * (fraction.min() + fraction.max()), 0.5 * (fraction.max() - fraction.min())
+    return np.column_stack([np.ones(len(fraction)), (fraction - middle) / max(half, 1e-9)])
+
+
+def _line(fraction: Array, weight: Array) -> Array:
+    """(2, n): from values along an edge to their offset at its middle and slope times half its length, weighted."""
+    basis = _basis(fraction)
+    weighted = basis.T * weight
+    return np.asarray(np.linalg.solve(weighted @ basis, weighted))
+
+
+def _beside(image: Image, measurement: Measurement, edges: int) -> _Beside:
+    p = measurement.prediction
+    xi = measurement.consensus.xi
+    grey = np.full((edges, 2, BESIDE_POINTS), np.nan)
+    moved = (p.jacobian @ xi)[:, None] * p.normal
+    for edge in p.layout.edges:
+        own = np.flatnonzero(p.layout.edge == edge)
+        own = own[np.linspace(0, len(own) - 1, BESIDE_POINTS).astype(int)]
+        for side, way in enumerate((-BESIDE_PX, BESIDE_PX)):
+            uv = p.uv_px[own] + moved[own] + way * p.normal[own]
+            three = [uv + k * p.normal[own] for k in (-1.0, 0.0, 1.0)]
+            maps = np.array(three, np.float32)
+            grey[edge, side] = read_profiles(
+                image, np.ascontiguousarray(maps[None, :, :, 0]), np.ascontiguousarray(maps[None, :, :, 1])
+            ).mean(axis=0)
+    return _Beside(grey, measurement.candidates.noise / math.sqrt(3.0))
+
+
+def _texture(grey: Array, edge: int, noise: float) -> float:
+    """Scatter of the grey levels along the more uneven side of an edge, without noise and shading."""
+    most = 0.0
+    ways = np.linspace(-1.0, 1.0, BESIDE_POINTS)
+    for side in grey[edge]:
+        if np.isfinite(side).all():
+            left = side - np.polyval(np.polyfit(ways, side, 1), ways)
+            most = max(most, float(left @ left) / (BESIDE_POINTS - 2) - noise**2)
+    return math.sqrt(most)
+
+
+def _alike(now: Array, then: Array, noise: float) -> float:
+    """Correlation of two pictures, free of gain and offset; nearly one where only their noise differs."""
+    a, b = now - now.mean(), then - then.mean()
+    power = float(a @ a) * float(b @ b)
+    correlation = float(a @ b) / math.sqrt(power) if power > 0.0 else 1.0
+    gain = float(a @ b) / float(b @ b) if float(b @ b) > 0.0 else 1.0
+    left = a - gain * b
+    if math.sqrt(float(left @ left) / len(a)) <= STILL_NOISES * math.sqrt(2.0) * noise and 0.5 < gain < 2.0:
+        return LIKE_STILL
+    return min(max(correlation, 0.0), MOST_LIKE)

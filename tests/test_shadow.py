@@ -1,0 +1,146 @@
+"""The belief beside the rules: it changes nothing, its rows say what pictures say, and it finds what is true."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from support.meters import box_gripper, difference, moved
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
+from support.watched import frames_of, new_monitor, reference_of, watched
+
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, Seen
+from gripmon.model.camera import make_camera
+from gripmon.model.records import Frame
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.monitor.shadow import Shadow, _alike, _texture
+from gripmon.simulate import Simulator
+from gripmon.simulate.scenario import Scenario
+
+FRAME_S = 1.0 / 30.0
+
+
+class Watching(Shadow):
+    """What was seen of the newest frame."""
+
+    seen: Seen
+
+    def _seen(self, frame: Frame, measurement: object) -> Seen | None:
+        seen = super()._seen(frame, measurement)  # type: ignore[arg-type]
+        assert seen is not None
+        self.seen = seen
+        return seen
+
+
+def seen_in(image: np.ndarray, pose: np.ndarray, opening_m: float, camera: object = None) -> Seen:
+    """A single frame's edges, against the nominal reference, measured from ``pose``."""
+    reference = reference_of(nominal_cam_T_grip())
+    monitor = Monitor(camera or make_camera(PAPER_LENS), sharp_gripper(), MonitorSettings(), reference)
+    shadow = Watching(monitor._camera, sharp_gripper(), monitor._tracker, reference, MonitorSettings())
+    frame = Frame(seq=0, stamp_ns=0, image=image, jaw_opening_m=opening_m)
+    shadow.see(frame, monitor._tracker.measure(frame, pose, 0.0), 0.0)
+    return shadow.seen
+
+
+def picture(pose: np.ndarray, scenario: Scenario | None = None) -> tuple[np.ndarray, float]:
+    simulator = Simulator(make_camera(PAPER_LENS), sharp_gripper(), pose, scenario or plain_scenario(), 1)
+    frame = simulator.frame(0)
+    assert isinstance(frame.image, np.ndarray) and frame.jaw_opening_m is not None
+    return frame.image, frame.jaw_opening_m
+
+
+@pytest.mark.parametrize("xi", [np.eye(6)[k] * (2e-4 if k < 3 else 2e-3) for k in range(6)])
+def test_rows_say_what_a_moved_gripper_does_to_the_picture(xi: np.ndarray) -> None:
+    """Two rendered pictures, both searched at the nominal pose: their difference is the rows times the motion."""
+    before, after = (seen_in(*_at(nominal_cam_T_grip(), step)) for step in (-xi, xi))
+    both = before.shown & after.shown
+    assert both.sum() >= 8
+    shift = after.measured[both] - before.measured[both]
+    assert np.abs(shift).max() > 0.3
+    assert shift == pytest.approx(before.rows[both][:, :, MOTION] @ (2.0 * xi), abs=0.08)
+    assert np.array_equal(before.rows[:, :, MOTION], before.rows[:, :, REFERENCE])
+
+
+def _at(pose: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    image, opening_m = picture(moved(pose, xi))
+    return image, pose, opening_m
+
+
+def test_a_longer_lens_and_brighter_light_move_edges_as_their_columns_say() -> None:
+    image, opening_m = picture(nominal_cam_T_grip())
+    pose = nominal_cam_T_grip()
+    plain = seen_in(image, pose, opening_m)
+    grown = 1.003
+    centre = np.array([PAPER_LENS.cx_px, PAPER_LENS.cy_px])
+    warp = np.hstack([grown * np.eye(2), ((1.0 - grown) * centre)[:, None]])
+    size = image.shape[1], image.shape[0]
+    zoomed = cv2.warpAffine(image, warp, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    longer = seen_in(zoomed, pose, opening_m)
+    spread = seen_in(cv2.dilate(image, np.ones((3, 3), np.uint8)), pose, opening_m)
+    for other, column, by in ((longer, FOCAL, np.log(grown)), (spread, LIGHT, 1.0)):
+        both = plain.shown & other.shown
+        shift = other.measured[both, 0] - plain.measured[both, 0]
+        wanted = by * plain.rows[both, 0, column]
+        assert np.abs(wanted).max() > 0.5
+        assert shift == pytest.approx(wanted, abs=0.08 if column == FOCAL else 0.45)  # a square spreads more
+
+
+def test_only_ends_tell_of_lengths() -> None:
+    image, opening_m = picture(nominal_cam_T_grip())
+    seen = seen_in(image, nominal_cam_T_grip(), opening_m)
+    lengths = np.abs(seen.rows[:, 0, LENGTHS])
+    finger = sharp_gripper().edge_finger
+    tips = np.array(["tip" in name for name in sharp_gripper().edge_ids]) & seen.shown
+    assert tips.any()
+    for f in (0, 1):
+        assert (lengths[tips & (finger == f), f] > 500.0).any()
+        assert not lengths[~tips | (finger != f), f].any()
+
+
+def test_pictures_are_alike_but_for_gain_and_noise() -> None:
+    rng = np.random.default_rng(4)
+    picture, other = rng.normal(120.0, 8.0, (2, 12))
+    for gain, offset in ((1.0, 0.0), (0.8, 15.0)):
+        again = gain * picture + offset + rng.normal(0.0, 0.5, 12)
+        assert _alike(again, picture, 0.5) == 0.999
+    assert _alike(other, picture, 0.5) < 0.8
+    assert _alike(picture + rng.normal(0.0, 4.0, 12), picture, 0.5) <= 0.98
+
+
+def test_texture_is_the_scatter_without_noise_and_shading() -> None:
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(400):
+        side = 100.0 + np.linspace(0.0, 20.0, 12) + rng.normal(0.0, 3.0, 12) + rng.normal(0.0, 1.0, 12)
+        found.append(_texture(side[None, None].repeat(2, axis=1), 0, 1.0) ** 2)
+    assert np.mean(found) == pytest.approx(9.0, rel=0.1)
+
+
+def test_records_are_the_same_with_and_without() -> None:
+    frames, _ = frames_of("clutter")
+    reference = reference_of(nominal_cam_T_grip())
+    beside = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, shadow=True)
+    records = [beside.process(frame) for frame in frames[:20]]
+    assert records == [*watched("clutter").records[:20]]
+    assert new_monitor().shadow is None
+
+
+@pytest.mark.parametrize("scene", ["clutter", "bump", "bent_finger"])
+def test_its_motion_is_true_within_its_bound(scene: str) -> None:
+    """A mount that jumps, a finger that bends.  After the jump, along the fingers, it takes its time."""
+    frames, truths = frames_of(scene)
+    reference = reference_of(nominal_cam_T_grip())
+    monitor = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, shadow=True)
+    assert monitor.shadow is not None
+    within = []
+    for frame, truth in zip(frames, truths, strict=True):
+        monitor.process(frame)
+        believed = monitor.shadow.newest
+        if believed is None:
+            within.append(False)
+            continue
+        error = difference(nominal_cam_T_grip(), truth.cam_T_grip) - believed.motion
+        assert np.linalg.norm(error[:3]) <= believed.bound.position_m
+        assert np.linalg.norm(error[3:]) <= believed.bound.rotation_rad
+        within.append(believed.bound.position_m < 1e-3)
+    assert np.mean(within) > (0.7 if scene == "bump" else 0.9)
