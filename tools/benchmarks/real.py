@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Stills of real grippers whose camera is screwed on and wasn't knocked: the true motion since the reference is zero in
 each of them.  They are replayed a second apart, untaught, and taught from every other still and judged on those
-between, among all of them, at alert limits fixed here: what is measured, valid, how large the bounds are, and what
-contradicts them.
+between, at alert limits fixed here: what is measured, valid, how large the bounds are, and what contradicts them.
 With --from-images each gripper's file is made of the same images first, by `gripmon gripper from-images`: its words and
 exit code, how far its outline lies beside the one drawn by hand, and the same replays with that file.
 Exit code 1 if a target is missed."""

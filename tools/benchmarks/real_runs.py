@@ -184,14 +184,13 @@ class _Project:
         return Part(names, uncounted, stills=stills, proposed_m=proposed_m, proposed_rad=proposed_rad)
 
     def taught(self, bound: str, half: str) -> Part:
-        """The other half, with what one half taught: among all stills, as untaught, since each shows where it was."""
+        """The other half, with what one half taught."""
         learnt_from, judged = _HALVES[half]
         model = self._models[half] = self._models.get(half) or self._teach(half, learnt_from)
         if isinstance(model, str):
             return Part(tuple(path.name for path in self._images[judged]), 1, half, refused=model)
-        part = self.replayed(bound, _EVERY, learnt_from, 1, model.path)
-        names, stills = part.names[judged], _with_alerts(part.stills, judged)
-        return msgspec.structs.replace(part, names=names, stills=stills, taught=half, left_out=model.left_out)
+        part = self.replayed(bound, judged, learnt_from, 1, model.path)
+        return msgspec.structs.replace(part, taught=half, left_out=model.left_out)
 
     def _teach(self, half: str, learnt_from: slice) -> _Model | str:
         folder = self._stills(self._images[learnt_from])
@@ -215,21 +214,6 @@ class _Project:
                 with (place / _STAMPS).open("w", newline="") as table:
                     csv.writer(table).writerows([("file", "stamp_ns", "jaw_opening_m"), *rows])
         return place
-
-
-def _with_alerts(stills: Sequence[Still], judged: slice) -> tuple[Still, ...]:
-    """The stills that are judged, with the alerts of those between them, too."""
-    judged_ones = range(len(stills))[judged]
-    out: list[Still] = []
-    waiting: tuple[str, ...] = ()
-    for number, still in enumerate(stills):
-        waiting += still.alerts
-        if number in judged_ones:
-            out.append(msgspec.structs.replace(still, alerts=waiting))
-            waiting = ()
-    if waiting and out:
-        out[-1] = msgspec.structs.replace(out[-1], alerts=out[-1].alerts + waiting)
-    return tuple(out)
 
 
 def _openings(table: Path) -> dict[str, str]:
