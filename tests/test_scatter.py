@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.by_numpy import drift
 from support.drift_noise import COVARIANCE, autocorrelated, claimed
 
+from gripmon.judge.drift import kernel
 from gripmon.judge.drift.statistics import LENGTHS, PRIOR_SHARE, PRIOR_WINDOWS, RARE, Scatter, Windows
 
 FRAMES, STREAMS = 12_000, 24
@@ -30,7 +30,20 @@ def covariances(scatter: Scatter, reported: np.ndarray, inflation: np.ndarray) -
     """(k, s, 6, 6) of means and of differences, ``reported`` (s, 6, 6) being what a frame claims for itself, and what
     the stream has shown counting by the variance's ``inflation`` (k, s) more.
     """
-    return drift.covariances(reported, scatter.of_differences, scatter.learnt, inflation, RARE)
+    lengths, streams = inflation.shape
+    matrices = (6, 6)
+    plain, whitening = (np.empty((2, some, streams, *matrices)) for some in (1, lengths))
+    of_mean, learnt_whitening = (np.empty((lengths, streams, *matrices)) for _ in range(2))
+    reference, to_reported, from_reported = (np.zeros((streams, *matrices)) for _ in range(3))
+    times, known = np.stack([inflation] * 3), np.zeros((2, lengths, streams), dtype=bool)
+    kernel.refresh(
+        reported, scatter.of_differences, scatter.learnt, times, RARE, reference, known, plain, of_mean, whitening,
+        learnt_whitening, to_reported, from_reported,
+    )  # fmt: skip
+    root = np.linalg.inv(whitening)
+    both = root @ np.swapaxes(root, -1, -2)
+    np.testing.assert_allclose(both[0], of_mean, rtol=1e-7, atol=1e-20)
+    return of_mean, both[1]
 
 
 def share(covariance: np.ndarray) -> float:
