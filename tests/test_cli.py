@@ -255,14 +255,6 @@ def test_a_signal_stops_the_daemon_with_everything_written(
     assert list(out.glob("*.rrd"))
 
 
-@pytest.mark.slow("6 s; a run that a signal ends is in the default run")
-def test_run_ends_after_its_duration(live_simulation: Path, tmp_path: Path):
-    done = gripmon("run", live_simulation, "--duration", "1.5", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "out" / "estimates.jsonl").read_text().splitlines()
-    assert 5 <= len(lines) <= 40
-
-
 def test_ctrl_c_in_simulate_leaves_no_traceback(tmp_path: Path):
     out = tmp_path / "out"
     with start("simulate", "clutter", "--out", out) as process:

@@ -136,28 +136,6 @@ def test_a_process_that_forgets_to_close_its_publisher_ends(endpoint: str):
     assert subprocess.run(command, timeout=WAIT_S, env=environment).returncode == 5
 
 
-def test_a_missing_camera_is_said_on_the_network(endpoint: str):
-    with daemon(endpoint, "silent"), plain_session(connect=endpoint) as session:
-        wait_until(lambda: any(s["state"] == "stale" for s in ask(session, f"{PREFIX}/state")), "the state stale")
-        (state,) = ask(session, f"{PREFIX}/state")
-        assert state["camera_connected"] is False and state["verdict"] == "unknown"
-        assert state["message"] == "no frames: camera 0 can't be opened"
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        alert = zenoh.ext.declare_advanced_subscriber(session, f"{PREFIX}/alert", history=history).recv()
-        assert json.loads(alert.payload.to_bytes())["cause"] == "no_camera"
-
-
-def test_a_second_daemon_on_the_same_port_says_so(endpoint: str):
-    with daemon(endpoint):
-        command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "ticking"]
-        environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
-        second = subprocess.run(command, capture_output=True, text=True, timeout=60.0, env=environment)
-    assert second.returncode == 1
-    assert second.stderr.splitlines()[-1].endswith(
-        f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
-    )
-
-
 def test_the_whole_daemon_from_camera_to_subscriber(endpoint: str, tmp_path: Path):
     """``gripmon run`` as shipped, slower for slow machines: what a subscriber got, in order, is what was written down.
 

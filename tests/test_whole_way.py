@@ -18,18 +18,12 @@ import numpy as np
 import pytest
 from support import new_user
 from support.loopback import wait_for_default_port
-from support.simulated import BOX_FINGERS, PAPER_LENS
 from support.teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
-from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.cli import main
-from gripmon.daemon.config import load_config, read_gripper
-from gripmon.daemon.config.typed import to_settings
-from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import Transform
 
-INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
 CHI2_999 = 22.5
 """Of six degrees of freedom."""
 STEP = new_user.STEP
@@ -84,54 +78,6 @@ def _rough_corners(user: new_user.NewUser, driver: Any) -> None:
 
 def gripmon(words: str) -> int:
     return main(words.split())
-
-
-@pytest.mark.slow("17 s: each calibration has tests of its own; from teaching to a knock is in the default run")
-def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, calibrated: Path):
-    camera = to_settings(read_yaml(calibrated / "camera.yaml"), CameraCalibration)
-    lens = PAPER_LENS
-    true = {"fx_px": lens.fx_px, "fy_px": lens.fy_px, "cx_px": lens.cx_px, "cy_px": lens.cy_px}
-    true |= {"kappa_per_px2": lens.kappa_per_px2}
-    off = np.array([getattr(camera.camera, name) - true[name] for name in camera.parameters])
-    covariance = np.reshape(camera.covariance, (len(off), len(off)))
-    assert len(off) == 5 and off @ np.linalg.solve(covariance, off) < 20.5  # 99.9 % of five degrees of freedom
-    assert abs(camera.camera.fx_px - lens.fx_px) < 0.3
-    hand_eye = to_settings(read_yaml(calibrated / "hand_eye.yaml"), HandEyeCalibration)
-    error = perturbation_between(from_record(hand_eye.cam_T_grip), user.cam_T_grip[0])
-    assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()
-    assert error @ np.linalg.solve(np.reshape(hand_eye.covariance, (6, 6)), error) < CHI2_999
-    found, true_gripper = read_gripper(calibrated / "gripper.yaml"), read_gripper(BOX_FINGERS)
-    corners, real = (g.points_grip_m(new_user.OPENING_M) for g in (found, true_gripper))
-    for name in INNER:
-        twin = f"{name[0].upper()}_{name.split('_', 1)[1].replace('inner', 'in')}"
-        apart = corners[found.point_ids.index(name)] - real[true_gripper.point_ids.index(twin)]
-        assert np.linalg.norm(apart) < 3e-5, name
-    # The fingers close as the real ones do, though the file was made at one opening.
-    closed = found.points_grip_m(0.01)[found.point_ids.index("right_inner_near")]
-    assert closed[0] == pytest.approx(0.005, abs=3e-5)
-
-
-@pytest.mark.slow("a browser; without one it is in the default run")
-def test_taught_in_the_browser_the_monitor_notices_a_knock(
-    user: new_user.NewUser, calibrated: Path, driver: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    if driver is None:
-        pytest.skip("no headless browser")
-    clicks = user.rough_px(np.random.default_rng(3), off_px=4.0)
-    first = calibrated / "work" / "000000.png"
-    with page(first, *_given(calibrated), "--out", tmp_path, "--robot", "arm1") as running:
-        visitor = Visitor(driver, running.url)
-        for name in INNER:
-            visitor.drag(name, *clicks[name])
-        assert "TCP" in visitor.text("#expected") or visitor.find("#accuracy").is_displayed()
-        visitor.click("#save")
-        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files")
-        assert visitor.complaints() == []
-        visitor.click("#done")
-        assert running.ended() == (0, "")
-    assert load_config(tmp_path / "config.yaml").settings.robot == "arm1"
-    _checked(tmp_path / "config.yaml", capsys)
-    _held_against_the_truth(user, _replayed(calibrated, tmp_path))
 
 
 def test_taught_without_a_page_the_running_monitor_notices_a_knock(
