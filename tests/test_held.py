@@ -25,10 +25,7 @@ PERIOD_S = 0.05
 WHOLE, HIDDEN, AGAIN = 6, 26, 8  # frames in which all shows, in which something is hidden, and after that
 GATE = 22.46  # 99.9 % of chi-square with six degrees of freedom
 
-MEASUREMENTS = [
-    "edges",
-    pytest.param("corners", marks=pytest.mark.slow("2 s each; by edges, as it comes, is in the default run")),
-]
+MEASUREMENTS = ["edges"]
 
 Mask = Callable[[np.ndarray], None]
 

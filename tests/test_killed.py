@@ -141,7 +141,7 @@ def forks(config: Path) -> Iterator[Forks]:
 
 @pytest.mark.parametrize(
     "kills",
-    [6, pytest.param(50, marks=pytest.mark.slow("two minutes; six kills are in the default run"))],
+    [4, pytest.param(50, marks=pytest.mark.slow("two minutes; four kills are in the default run"))],
 )
 def test_killed_at_any_moment_it_goes_on_from_what_it_said_last(kills: int, tmp_path: Path):
     """Frames as fast as they can be measured, a change of reference with nearly every one of them, and so many

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.frame_feeder import FORMATS
 from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
 
@@ -84,10 +83,6 @@ def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, Netwo
     [
         "raw",
         "ros2_image",
-        *(
-            pytest.param(each, marks=pytest.mark.slow("8 s: how it is decoded is in test_network_payload"))
-            for each in ("raw_padded", "png", "ros2_compressed")
-        ),
     ],
 )
 def test_lossless_frames_give_the_transforms_of_the_files(
@@ -97,10 +92,6 @@ def test_lossless_frames_give_the_transforms_of_the_files(
     assert len({line["jaw_opening_m"] for line in lines}) > FRAMES // 2, "the jaw's opening comes with each frame"
     assert lines == replayed
     assert "0 refused, 0 dropped" in daemon.said() and "malformed" not in daemon.said()
-
-
-def test_all_formats_are_tried():
-    assert set(FORMATS) == {"raw", "raw_padded", "png", "jpeg", "ros2_image", "ros2_compressed"}
 
 
 @contextmanager

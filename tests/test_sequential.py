@@ -205,7 +205,7 @@ def rested() -> SequentialTest:
     return test
 
 
-@pytest.mark.parametrize("sizes", [13.0, 15.0, 20.0, 60.0, 200.0])
+@pytest.mark.parametrize("sizes", [13.0, 60.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_delay_of_a_step_is_that_of_the_formulas(rested: SequentialTest, sizes: float, sign: float):
     rng, test = np.random.default_rng(5), copy.deepcopy(rested)
@@ -246,7 +246,7 @@ def test_a_step_is_told_from_an_offset_and_its_length_dates_it():
 # --- what does not decide ---
 
 
-@pytest.mark.parametrize("sizes", [10.0, 100.0, 1e4])
+@pytest.mark.parametrize("sizes", [10.0, 1e4])
 def test_one_wild_frame_never_decides(sizes: float):
     """Not the first one either, and not one every now and then."""
     rng = np.random.default_rng(8)

@@ -10,12 +10,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 import pytest
 import yaml
 from support.taught_by_hand import Rig, make_rig
 from support.teach_page_browser import DEADLINE_S, Visitor, browser, page
+from test_live_camera import MjpegServer
 
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
@@ -129,6 +131,104 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
     capsys.readouterr()
     assert main(["check", str(tmp_path / "config.yaml")]) == 0
     assert "sound" in capsys.readouterr().out
+
+
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
+def test_a_live_camera_and_two_pages(rig: Rig, driver: Any, tmp_path: Path):
+    class Camera(MjpegServer):
+        def stream(self, send: Any) -> None:
+            jpeg = cv2.imencode(".jpg", rig.image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+            head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+            while not self.stopping.wait(0.05):
+                send(head + jpeg + b"\r\n")
+
+    camera = Camera()
+    opening_m = rig.truth["jaw_opening_m"]
+    try:
+        with page("--live", f"http://127.0.0.1:{camera.port}/", *rig.options, "--out", tmp_path) as running:
+            first = Visitor(driver, running.url)
+            first.script("document.querySelector('#opening').value = arguments[0]", 1e3 * opening_m)
+            for name, (u, v) in rig.rough(*INNER).items():
+                first.drag(name, u, v)
+            assert max(off_px(first, rig, name) for name in INNER) < SNAPPED_PX, first.text("#status")
+            first.click("#take")
+            first.wait(lambda: "1 image taken" in first.text("#status"), "the image")
+            tab = driver.current_window_handle
+            driver.switch_to.new_window("tab")
+            second = Visitor(driver, running.url)
+            # The image is everybody's, the corners are one's own.
+            assert second.script("return document.querySelectorAll('#picture option').length") == 2
+            assert second.state("L_in_near") == "idle"
+            assert second.complaints() == []
+            driver.close()
+            driver.switch_to.window(tab)
+            assert first.state("L_in_near") == "measured"
+            first.click("#save")
+            first.wait(lambda: "gripmon check" in first.text("#saved"), "the files")
+            assert first.complaints() == []
+            driver.get("about:blank")  # or it would go on asking for live images
+            running.process.send_signal(signal.SIGINT)
+            assert running.ended() == (130, "gripmon: interrupted\n")
+    finally:
+        camera.stop()
+    config = load_config(tmp_path / "config.yaml")
+    assert config.settings.source.device == f"http://127.0.0.1:{camera.port}/"  # type: ignore[union-attr]
+    assert config.jaw_opening_m == pytest.approx(opening_m)
+    assert config.taught is not None
+    assert Path(config.taught.provenance.images[0].file) == tmp_path / "teaching" / "live-000.png"
+    assert (tmp_path / "teaching" / "live-000.png").is_file()
+
+
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
+def test_a_configuration_that_is_there_gets_its_line(rig: Rig, driver: Any, tmp_path: Path):
+    given = yaml.safe_load((rig.folder / "sim" / "config.yaml").read_text())
+    given["gripper"] = str(rig.folder / "gripper.yaml")
+    given["source"]["path"] = str(rig.folder / "sim")
+    (tmp_path / "mine.yaml").write_text("# my own words\n" + yaml.safe_dump(given))
+    with page(rig.image_path, "--config", tmp_path / "mine.yaml") as running:
+        visitor = Visitor(driver, running.url)
+        # The reference is known: nothing has to be dragged.
+        visitor.wait(lambda: "corners measured" in visitor.text("#status"), "edges")
+        assert visitor.state("L_in_near") == "unplaced" and off_px(visitor, rig, "L_in_near") < SNAPPED_PX
+        visitor.click("#save")
+        visitor.wait(lambda: "mine.yaml is there already" in visitor.text("#saved"), "the question")
+        assert not (tmp_path / "taught.yaml").exists()
+        visitor.click("#save")
+        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files")
+        assert visitor.complaints() == []
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+    assert (tmp_path / "mine.yaml").read_text().startswith("# my own words\n")
+    assert load_config(tmp_path / "mine.yaml").taught is not None
+
+
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
+def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
+    """How they become a gripper is tested with the whole way."""
+    with page(rig.image_path, "--camera", rig.options[1], "--out", tmp_path) as running:
+        visitor = Visitor(driver, running.url)
+        assert "4 of the 4 inner corners to go" in visitor.text("#status")
+        assert "corners don't snap" in visitor.text("#status") and visitor.text("#save") == "Save corners"
+        assert visitor.find("#save").get_attribute("disabled")
+        # One thing at a time: the inner corners, and then what belongs to one that was put.
+        handles = "return [...document.querySelectorAll('.handle:not([visibility])')].map((g) => g.dataset.corner)"
+        inner = [f"{side}_inner_{end}" for side in ("left", "right") for end in ("near", "far")]
+        assert sorted(visitor.script(handles)) == sorted(inner)
+        u, v = rig.rough("L_in_near")["L_in_near"]
+        visitor.drag("left_inner_near", u, v)
+        beside = [f"left_{which}_near" for which in ("outer", "end", "rise")]
+        assert sorted(visitor.script(handles)) == sorted([*inner, *beside])
+        assert visitor.at("left_inner_near") == pytest.approx((u, v), abs=2.0)  # whole pixels of the screen
+        assert "3 of the 4 inner corners to go" in visitor.text("#status")
+        visitor.keys("z", control=True)
+        assert visitor.state("left_inner_near") == "idle"
+        visitor.keys("y", control=True)
+        assert visitor.state("left_inner_near") == "put" and visitor.state("left_outer_near") == "idle"
+        visitor.click("#save")
+        visitor.wait(lambda: "left_inner_far: is missing" in visitor.text("#saved"), "what is missing")
+        assert not list(tmp_path.iterdir()) and visitor.complaints() == []
+        visitor.click("#done")
+        assert running.ended() == (0, "")
 
 
 def test_an_interrupt_leaves_nothing_running(rig: Rig, tmp_path: Path):
