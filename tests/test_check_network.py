@@ -59,9 +59,6 @@ def test_a_session_that_cannot_be_opened(
 
 
 @pytest.mark.parametrize(
-    "package", ["rosbags", pytest.param("xxhash", marks=pytest.mark.slow("the other package is in the default run"))]
-)
-@pytest.mark.parametrize(
     ("sections", "key"),
     [
         ({"source": {"kind": "zenoh", "topic": "/image", "format": "ros2_image"}}, "source.format"),
@@ -72,12 +69,11 @@ def test_a_session_that_cannot_be_opened(
 def test_packages_that_are_missing(
     sections: dict[str, object],
     key: str,
-    package: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    for name in [package, *(each for each in sys.modules if each.startswith(f"{package}."))]:
+    for name in ["rosbags", *(each for each in sys.modules if each.startswith("rosbags."))]:
         monkeypatch.setitem(sys.modules, name, None)  # as Python notes a module that can't be had
     typestore.cache_clear()
     jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}

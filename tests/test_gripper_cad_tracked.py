@@ -31,7 +31,7 @@ from tools.benchmarks.meshes import (
     write_meshes,
 )
 
-FRAMES, FEW = 45, 24
+FRAMES, FEW = 36, 24
 ROUNDED_M = (0.002, 0.008)
 
 SHAPES = {

@@ -22,6 +22,7 @@ from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.simulated import nominal_cam_T_grip
 from support.watched import frames_of, new_monitor, pose_of, reference_of, restarted
 
+from gripmon.cli import main
 from gripmon.judge.references import ReferenceBook
 from gripmon.model.records import (
     AlertEvent,
@@ -303,12 +304,15 @@ def test_a_command_to_nobody_is_one_line_and_exit_code_3(cell: Cell):
         (["undo", "--zenoh-config", "x.json5"], "send: --connect has no effect beside --zenoh-config; one of them\n"),
     ],
 )
-def test_wrong_usage_of_send_is_one_line_and_exit_code_2(cell: Cell, arguments: list[str], said: str):
-    done = cell.send(*arguments)
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+def test_wrong_usage_of_send_is_one_line_and_exit_code_2(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["send", *arguments, "--robot", "demo", "--connect", free_endpoint()]) == 2
+    assert capsys.readouterr() == ("", said)
 
 
 @pytest.mark.parametrize("robot", ["two words", "a/b", ""])
-def test_a_name_that_can_not_be_is_wrong_usage(cell: Cell, robot: str):
-    done = cell.send("undo", robot=robot)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "can't be part of a Zenoh key" in done.stderr
+def test_a_name_that_can_not_be_is_wrong_usage(robot: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["send", "undo", "--robot", robot, "--connect", free_endpoint()]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "can't be part of a Zenoh key" in said

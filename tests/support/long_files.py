@@ -41,7 +41,6 @@ LONGEST = (
     "test_calibrate_intrinsics",
     "test_smoothing",
     "test_backlog",
-    "test_whole_way",
     "test_promise",
     "test_recording_faults",
     "test_gripper_library",
