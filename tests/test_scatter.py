@@ -134,3 +134,36 @@ def test_what_is_not_usable_is_not_learnt():
     np.testing.assert_array_equal(scatter.of_differences[:, 1], before[:, 1])
     np.testing.assert_array_equal(scatter.windows[:, 1], windows[:, 1])
     assert (scatter.of_differences[:, 0] != before[:, 0]).all()
+
+
+def what_is_missing(shown: np.ndarray) -> np.ndarray:
+    """The part of the claimed covariance, direction by direction, that exceeds what was shown (..., 6, 6)."""
+    root = np.linalg.cholesky(COVARIANCE)
+    inverse = np.linalg.inv(root)
+    shares, directions = np.linalg.eigh(inverse @ shown @ inverse.T)
+    towards = root @ directions
+    return np.asarray((towards * np.maximum(1.0 - shares, 0.0)[..., None, :]) @ np.swapaxes(towards, -1, -2))
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3, 1.0, 3.0])
+def test_what_is_missing_of_the_claim_comes_on_top_direction_by_direction(seen: float):
+    """Less than claimed in some directions, more in others; against eigenvalues, at every length."""
+    rng = np.random.default_rng(5)
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    mix = np.eye(6) + 0.2 * rng.normal(size=(len(LENGTHS), 2, 6, 6))
+    scatter.of_differences[:] = seen * mix @ COVARIANCE @ mix.swapaxes(-1, -2) + 1e-3 * COVARIANCE
+    scatter.windows[:] = rng.uniform(12.0, 200.0, scatter.windows.shape)
+    inflation = rng.uniform(1.0, 3.0, (len(LENGTHS), 2))
+    parts = 0.25 * scatter.of_differences
+    parts[-1] *= 2.0  # beyond the longest, windows count as independent
+    total, shown = (
+        np.flip(np.cumsum(np.flip(times[..., None, None] * parts, axis=0), axis=0), axis=0)
+        for times in (inflation, scatter.learnt)
+    )
+    rarely = np.concatenate([shown, np.zeros_like(shown[:1])])[RARE]
+    differences = inflation[..., None, None] * scatter.of_differences + 2.0 * what_is_missing(shown[:1] - rarely)
+    for found, expected in zip(
+        covariances(scatter, claimed(2), inflation), (total + what_is_missing(shown[:1]), differences), strict=True
+    ):
+        assert (np.abs(found - expected) <= 1e-7 * np.abs(expected).max(axis=(-2, -1), keepdims=True)).all()
