@@ -74,8 +74,6 @@ def test_a_port_in_use_is_said_in_one_line(tmp_path: Path, endpoint: str):
     ("file", "text", "said"),
     [
         ("there.json5", None, "publish.zenoh_config: no file "),
-        ("there.json5", "{mode: 'peer', listen: 3}", "publish.zenoh_config: "),
-        ("there.json5", "no json", "publish.zenoh_config: "),
         ("there.yaml", "mode: sideways", "publish.zenoh_config: "),
     ],
 )
