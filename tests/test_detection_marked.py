@@ -78,7 +78,7 @@ def test_discs_that_a_finger_cuts_are_left_out():
     whole = found_in(image, PAPERS)
     assert len(whole) == 64
     cut = 0
-    for column in np.linspace(200.0, 420.0, 12):
+    for column in np.linspace(200.0, 420.0, 7):
         covered = render(
             LENS, HELD, PAPERS, Look(supersampling=3, clutter="plain"), seed=1,
             covers=[(np.array([[-5.0, -5.0], [column, -5.0], [column + 20.0, 485.0], [-5.0, 485.0]]), 90.0)],
@@ -87,7 +87,7 @@ def test_discs_that_a_finger_cuts_are_left_out():
         if isinstance(sight, Sighting):
             assert disc_errors(sight, LENS, HELD).max() < 0.2
             cut += 1
-    assert cut >= 8
+    assert cut >= 5
 
 
 def test_a_wrong_count_of_discs_is_told():
