@@ -30,7 +30,6 @@ from gripmon.model.records import (
     Protection,
     State,
     Verdict,
-    to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.ends import MISREAD_PROBABILITY
@@ -599,16 +598,6 @@ def test_a_pose_that_nothing_proved_is_not_what_a_restart_expects():
     seen = watch(frames, truths, monitor)
     assert all(record.cam_T_grip is not None for record in seen.records)
     assert monitor.state().cam_T_grip == to_record(reference_T)
-
-
-# --- again ---
-
-
-def test_the_same_frames_give_the_same_records_to_the_byte():
-    hidden = msgspec.structs.replace(RIM, end_s=30.4 / FPS)
-    scenario = scene(40, props=(hidden,), mount=(along_fingers(-2e-3, 34.4 / FPS),))
-    one, other = watched(scenario), watched(scenario)
-    assert [to_json(r) for r in one.records] == [to_json(r) for r in other.records]
 
 
 # --- light ---
