@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from support.by_numpy.integrity import beyond
 
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of, kernel
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
-from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, QUANTILES, Tails
+from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails
 
 # --- quantiles ---
 
@@ -25,14 +26,6 @@ VARIANCES = [
     (1.0, 0.03, 0.02),
 ]
 NORMAL = np.random.default_rng(1).normal(size=(400_000, 3))
-
-
-def beyond(tails: Tails, radius: np.ndarray) -> np.ndarray:
-    """Probabilities of lengths above ``radius``; 1 for a negative one."""
-    square = np.square(np.maximum(radius, 0.0) / tails.sigma)
-    one = np.interp(square, QUANTILES.squares[0], QUANTILES.log_risk) + tails.factor
-    three = np.interp(square, QUANTILES.squares[1], QUANTILES.log_risk)
-    return np.asarray(10.0 ** np.minimum(one, three))
 
 
 def turned(variances: tuple[float, ...], seed: int = 2) -> np.ndarray:
@@ -454,13 +447,3 @@ def test_that_a_lone_fingers_ends_are_something_else_is_one_hypothesis():
     tip = hypotheses_of(SAID[:3], np.zeros(3, dtype=int), ("finger a",), ALONG[:3], INNER[:3], False)
     doubting_all = [k for k, keep in enumerate(tip.keep) if not keep[~ALONG[:3]].any()]
     assert doubting_all == [tip.ends], "of one edge at its end, too"
-
-
-def test_what_determines_nothing_is_an_error():
-    with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        kernel.separate(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 6, 6)), np.zeros((1, 0, 6)), 6)
-
-
-def test_doubts_of_none_bound_nothing():
-    none = Separation(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 0, 6)))
-    assert Doubts.of((), np.zeros(0), none, 1.0).levels(1e-5) == (0.0, 0.0, "")

@@ -2,7 +2,8 @@
 of filters behind the anchor, and the root of the sum over the hypotheses' tails.
 
 h hypotheses, v edges, f parts of the gripper, m unknowns of which the first n are asked for, g averages; lengths in m
-and rad.  What they are for stands in :mod:`~gripmon.track.integrity.separation`.
+and rad.  What they are for stands in :mod:`~gripmon.track.integrity.separation`.  Tests hold each against the function
+of its name in ``tests/support/by_numpy/integrity.py``.
 """
 
 from __future__ import annotations

@@ -1,0 +1,250 @@
+"""What ``track.integrity.kernel`` compiles, function by function, by NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gripmon.model.records import Array
+from gripmon.track.integrity.kernel import Ints
+from gripmon.track.integrity.separation import QUANTILES, Tails
+
+
+def add_up(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    part: Ints,
+    parts: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+) -> tuple[Array, Array, Array, Array]:
+    (edges, m), own = pull.shape, part == np.arange(parts)[:, None, None]
+    normal = (keep @ information.reshape(edges, -1)).reshape(-1, m, m) + known
+    spread = (keep @ middle.reshape(edges, -1)).reshape(-1, m, m) + known
+    return keep @ pull + known_pull, normal, spread, np.einsum("hv,fpv,pvi->hfi", keep, own, model)
+
+
+def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int) -> tuple[Array, Array, Array]:
+    inverse = np.linalg.inv(normal)[:, :unknowns]
+    covariance = inverse @ spread @ inverse.transpose(0, 2, 1)
+    return np.einsum("hij,hj->hi", inverse, sums), covariance, np.einsum("hij,hfj->hfi", inverse, of_model)
+
+
+def with_pose(
+    sums: Array, normal: Array, spread: Array, of_model: Array, at: Array, covariance: Array, off: Array
+) -> tuple[Array, Array, Array, Array]:
+    sums, normal, spread, of_model = sums.copy(), normal.copy(), spread.copy(), of_model.copy()
+    information = np.linalg.inv(covariance)
+    sums[:, :6] += information @ at
+    normal[:, :6, :6] += information
+    spread[:, :6, :6] += information
+    of_model[:, :, :6] += off @ information
+    return sums, normal, spread, of_model
+
+
+def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float, more: Array, other: Array) -> Array:
+    away, both = shift - at, times * covariance + more + squared(off - other)
+    return np.asarray(np.einsum("hi,hi->h", away, np.linalg.solve(both, away[:, :, None])[:, :, 0]))
+
+
+def squared(off: Array) -> Array:
+    return np.asarray(np.einsum("...fi,...fj->...ij", off, off))
+
+
+def with_and_without(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    part: Ints,
+    parts: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+    at: Array,
+    covariance: Array,
+    off: Array,
+    times: float,
+    together: bool,
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
+    sums = add_up(pull, information, middle, model, part, parts, keep, known, known_pull)
+    alone = separate(*sums, 6)
+    with_it = separate(*with_pose(*(each[: len(each) * together] for each in sums), at, covariance, off), 6)
+    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
+
+
+def jumped(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    prior: Array,
+    stays: Array,
+    times: float,
+) -> Array:
+    every = np.concatenate([jumps, np.zeros((1, 6, 6))])
+    share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
+    spread = times * covariance + known + squared(off - known_off)
+    unit = np.sqrt(known.diagonal())  # so that densities are numbers of everyday size
+    both, away = (spread[:, None] + every) / np.outer(unit, unit), ((shift - at) / unit)[:, None, :, None]
+    # Not SciPy's density: it leaves out directions a million times better known than another, as along a bare side.
+    square = (away * np.linalg.solve(both, np.broadcast_to(away, (*both.shape[:3], 1)))).sum(axis=(2, 3))
+    log_density = -0.5 * (square + np.linalg.slogdet(both)[1])
+    weight = share * np.exp(log_density - np.max(log_density, axis=1, keepdims=True))
+    return np.asarray((weight / weight.sum(axis=1, keepdims=True))[:, :-1])
+
+
+def joined(
+    mean: Array, before: Array, off: Array, shift: Array, covariance: Array, of_model: Array
+) -> tuple[Array, Array, Array]:
+    """In the information form, as the product's isn't."""
+    information, other = np.linalg.inv(before), np.linalg.inv(covariance)
+    after = np.linalg.inv(information + other)
+    kept, taken = after @ information, after @ other
+    off, of_model = np.broadcast_arrays(off, of_model)
+    return (
+        np.einsum("rij,rj->ri", kept, mean) + np.einsum("rij,rj->ri", taken, shift),
+        after,
+        np.einsum("rij,rfj->rfi", kept, off) + np.einsum("rij,rfj->rfi", taken, of_model),
+    )
+
+
+def after_jumps(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    fit: Ints,
+    jump: Ints,
+) -> tuple[Array, Array, Array]:
+    before, count = known + jumps[jump], len(fit)
+    return joined(np.tile(at, (count, 1)), before, known_off, shift[fit], covariance[fit], off[fit])
+
+
+def knocked(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    known: Array,
+    known_off: Array,
+    jumps: Array,
+    share: Array,
+    along: Array,
+    prior: Array,
+    probable: Array,
+    stays: Array,
+    endless: Array,
+    least: float,
+    times: float,
+) -> tuple[Ints, Array, float, Array, Array, Array]:
+    before = np.outer(probable, share)
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    weight = prior[:, None] * np.where(np.outer(endless, along), np.maximum(given, before), given)
+    counts = weight > least
+    fit, jump = np.nonzero(counts)
+    poses = after_jumps(shift, covariance, off, at, known, known_off, jumps, fit, jump)
+    return fit, weight[counts], float(weight[~counts].sum()), *poses
+
+
+def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
+    parts = shift.reshape(-1, 2, 3)
+    covariance = inflation**2 * covariance + np.einsum("hfi,hfj->hij", of_model, of_model)
+    blocks = np.stack([covariance[:, :3, :3], covariance[:, 3:, 3:]])
+    return np.sqrt(np.einsum("hpi,hpi->ph", parts, parts)), *Tails.of(blocks)
+
+
+def beyond(tails: Tails, radius: Array) -> Array:
+    """Probabilities of lengths above ``radius``; 1 for a negative one."""
+    square = np.square(np.maximum(radius, 0.0) / tails.sigma)
+    one = np.interp(square, QUANTILES.squares[0], QUANTILES.log_risk) + tails.factor
+    three = np.interp(square, QUANTILES.squares[1], QUANTILES.log_risk)
+    return np.asarray(10.0 ** np.minimum(one, three))
+
+
+def levels(
+    prior: Array, away: Array, sigma: Array, factor: Array, risk: float, near: float, *_tables: object
+) -> tuple[float, float, int]:
+    share = risk / max(len(prior), 1)
+    counted = np.flatnonzero(prior > share)
+    if not len(counted):
+        return 0.0, 0.0, -1
+    left = risk - float(prior[prior <= share].sum())
+    prior, away, tails = prior[counted], away[:, counted], Tails(sigma[:, counted], factor[:, counted])
+    # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
+    # What is less probable than the risk may lie beyond the level altogether.
+    alone = np.where(prior > left, away + tails.radius(np.broadcast_to(left / prior, away.shape)), 0.0)
+    least = alone.max(axis=1)
+    most = (away + tails.radius(np.broadcast_to(left / len(prior) / prior, away.shape))).max(axis=1)
+    least = np.maximum(least, 1e-3 * most)
+    while (most > near * least).any():
+        middle = np.sqrt(least * most)
+        enough = (prior * beyond(tails, middle[:, None] - away)).sum(axis=1) <= left
+        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+    owed = prior * beyond(tails, most[:, None] - away)[0]
+    return float(most[0]), float(most[1]), int(counted[np.argmax(owed)])
+
+
+def follow(
+    mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
+) -> tuple[Array, Array, Array, Array]:
+    before = covariance + np.diag(creep)
+    gain = np.einsum("gii->g", before @ np.linalg.inv(before + of_frame))
+    return *joined(mean, before, off, shift, of_frame, of_model), gain
+
+
+def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Array) -> tuple[Array, Array, Array]:
+    every = np.ones((len(shift), 1))
+    return joined(shift, covariance, off, every * at, every[:, None] * known, np.zeros_like(off))
+
+
+def of_motion(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    first: Ints,
+    first_shift: Array,
+    first_covariance: Array,
+    first_off: Array,
+    lever: Array,
+    turn: Array,
+    more: Array,
+) -> tuple[Array, Array, Array]:
+    shift = shift - first_shift[first] @ turn.T
+    covariance = covariance + turn @ first_covariance[first] @ turn.T + more
+    off = off - first_off[first] @ turn.T
+    return shift @ lever.T, lever @ covariance @ lever.T, off @ lever.T
+
+
+def telling(
+    mean: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    wander: Array,
+    shift: Array,
+    of_frame: Array,
+    of_model: Array,
+    rows: Ints,
+    limit: float,
+) -> tuple[Array, Array, Array]:
+    mean, covariance = mean - at, covariance + np.diag(wander)
+    shift, of_frame, of_model = shift[rows], of_frame[rows], of_model[rows]
+    none = np.zeros((1, 6))
+    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 0.0 * off, 1.0, np.zeros((6, 6)), none) > limit
+    frame |= np.einsum("gii->g", of_frame[:, :3, :3]) < np.einsum("gii->g", covariance[:, :3, :3])
+    frame &= rows >= 0
+    each = frame[:, None, None]
+    return (
+        np.where(frame[:, None], shift, mean),
+        np.where(each, of_frame, covariance),
+        np.where(each, of_model, off),
+    )
