@@ -127,18 +127,6 @@ def test_a_bad_frame_is_a_record_with_a_reason_and_leaves_nothing_behind(spoil: 
         assert msgspec.structs.replace(seen, verdict=told.verdict, smoothed=told.smoothed) == told
 
 
-@pytest.mark.slow("10 s; the same frames in the middle of a stream are in the default run")
-@pytest.mark.parametrize(("spoil", "reason"), BAD.values(), ids=list(BAD))
-def test_a_bad_first_frame_is_survived(spoil: Callable[[Frame], Frame], reason: str):
-    frames, _ = frames_of("static")
-    monitor, undisturbed = new_monitor(), new_monitor()
-    bad = monitor.process(spoil(frames[0]))
-    assert (bad.verdict, bad.state, bad.cam_T_grip) == (Verdict.UNKNOWN, State.ACQUIRING, None)
-    assert bad.reason is not None and bad.reason.startswith(reason)
-    for frame in frames[1:5]:
-        assert monitor.process(frame) == undisturbed.process(frame)
-
-
 def test_bad_frames_that_last_give_one_alert_and_none_while_they_are_few():
     frames, _ = frames_of("static")
     monitor = new_monitor()

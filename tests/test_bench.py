@@ -7,7 +7,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 SIZE = (384, 288)
@@ -98,53 +97,6 @@ def test_the_page_has_every_row_and_what_is_missed():
     assert "- longest (31.5 ms, at most 10 ms)" in page and "predict   48 µs" in page
 
 
-def test_every_row_can_be_called():
-    """Names of functions stand in a table, since what they import is heavy."""
-    from benchmarks import latency, latency_loop, latency_program
-
-    rooms = {"loop": latency_loop, "program": latency_program}
-    for part in latency.PARTS.values():
-        room, _, function = part.measure.split()[0].partition(".")
-        assert callable(getattr(rooms[room], function))
-
-
-def test_where_the_gripper_is_gone_nothing_of_it_is_in_the_image():
-    """By the simulator's own truth, before and after."""
-    from benchmarks import scene
-
-    for kind in ("hidden", "lost"):
-        ring = scene.render(SIZE, 46, kind=kind)
-        first = int(np.flatnonzero(ring.gone)[0])
-        assert ring.gone[first:].all() and 0 < first < 45
-        if kind == "lost":
-            tcp_px = scene.config_for(SIZE).camera.project(ring.true_tcp_m)
-            assert (tcp_px[first:, 0] > 2 * SIZE[0]).all() and (abs(tcp_px[:first, 0] - SIZE[0] / 2) < 20).all()
-        else:
-            # A hand has no edges: its borders and the fingers' have left the view.
-            steps = [np.abs(np.diff(image.astype(float), axis=1)).max() for image in ring.images[[0, first]]]
-            assert steps[1] < 0.5 * steps[0]
-
-
-def test_visps_model_is_the_gripper():
-    """Its faces look outwards: by the volume that they enclose, with the rear faces that were left out."""
-    from benchmarks import visp
-    from benchmarks.machine import ROOT
-
-    from gripmon.daemon.config import read_gripper
-
-    gripper = read_gripper(ROOT / "configs" / "grippers" / "two_box_fingers.yaml")
-    lines = visp.model_text(gripper).splitlines()
-    count = int(lines[1])
-    points = np.array([line.split() for line in lines[2 : 2 + count]], float)
-    np.testing.assert_allclose(points, gripper.points_grip_m(None), atol=1e-9)
-    faces = [list(map(int, line.split()))[1:] for line in lines[5 + count : 5 + count + int(lines[4 + count])]]
-    assert len(faces) == 10
-    for loop in map(points.__getitem__, faces):
-        normal = np.cross(loop[1] - loop[0], loop[2] - loop[1])
-        middle = points[points[:, 0] * loop[0, 0] > 0.0].mean(axis=0)  # of its finger
-        assert normal @ (loop.mean(axis=0) - middle) > 0.0
-
-
 def test_stop_watches_count_every_nanosecond_once(monkeypatch: pytest.MonkeyPatch):
     """By a clock that advances by 1 ns whenever it is read."""
     from benchmarks import stages
@@ -160,12 +112,3 @@ def test_stop_watches_count_every_nanosecond_once(monkeypatch: pytest.MonkeyPatc
     watches.counting = False
     outer()
     assert sum(watches.total_ns.values()) == 5
-
-
-def test_stop_watches_leave_the_product_as_it_was():
-    from benchmarks import stages
-
-    before = {(owner, name): getattr(owner, name) for places in stages.STAGES.values() for owner, name in places}
-    with stages.stop_watches():
-        assert all(getattr(owner, name) is not function for (owner, name), function in before.items())
-    assert all(getattr(owner, name) is function for (owner, name), function in before.items())

@@ -110,27 +110,6 @@ def test_the_promise_leaves_out_a_closed_list(condition: str, valid_by: str, pro
     assert integrity_stats.promised(line(condition=condition, valid_by=valid_by)) is promised
 
 
-def test_frames_until_the_first_valid_one():
-    from benchmarks.integrity_stats import figures, first_valid
-
-    late, never = line(valid=[False] * 4 + [True] * 6), line(valid=[False] * 10)
-    assert (first_valid(line()), first_valid(late), first_valid(never)) == (1.0, 5.0, np.inf)
-    out = figures([line(), late, never])
-    assert (out["first_valid"], out["never_valid"]) == (5.0, 1)
-
-
-def test_frames_valid_at_other_limits():
-    """By the bound; one that another doubt keeps from being valid isn't at any limit, nor one turned too far."""
-    from benchmarks.integrity_stats import figures
-
-    level_m = [1e-4, 1e-4, 1e-4, 6e-4, 6e-4, 1.5e-3, 1.5e-3, 3e-3, 1e-4, 1e-4]
-    valid = [False, True, False, False, False, False, False, False, True, True]
-    level_rad = [1e-3] * 8 + [1e-3, 0.5]
-    out = figures([line(level_m=level_m, valid=valid, level_rad=level_rad)])
-    # Of nine frames: within 0.5 mm the first and the last but one; 1 mm: two more; 2 mm: two more.
-    assert out["within"] == pytest.approx([2 / 9, 4 / 9, 6 / 9])
-
-
 def test_frames_from_a_knock_until_it_is_said_found_and_valid():
     from benchmarks.integrity_stats import Knock, knock_of
 
@@ -186,16 +165,6 @@ class _Record:
         self.since_reference = since or _Bound()
 
 
-def test_both_bounds_are_read_where_a_record_has_them():
-    from benchmarks.integrity_runs import bounds_of
-
-    class Old:
-        protection = _Bound()
-
-    assert bounds_of(Old()) == {"reference": None, "absolute": (1e-4, 2e-3)}  # type: ignore[arg-type]
-    assert bounds_of(_Record()) == {"reference": (1e-4, 2e-3), "absolute": None}  # type: ignore[arg-type]
-
-
 def test_by_the_reference_its_own_error_is_no_error():
     from benchmarks.integrity_runs import Truth
 
@@ -223,31 +192,6 @@ def test_valid_frames_beyond_the_absolute_bound_are_counted_whatever_makes_them_
     error_m = [1e-5] * 3 + [2e-4, 2e-4] + [1e-5] * 5
     valid = [True] * 4 + [False] + [True] * 5
     assert figures([line(absolute_error_m=error_m, valid=valid), line()])["beyond_absolute"] == [1, 1]
-
-
-def test_a_page_beside_another_revision():
-    from benchmarks.integrity_compare import as_text
-
-    before = [line(commit="old", valid=[False] * 5 + [True] * 5), line(commit="old", scene=1)]
-    after = [line(commit="new"), line(commit="new", scene=1, grey_dn=90.0), line(commit="new", scene=7)]
-    page = as_text(after, before)
-    (row,) = (text for text in page.splitlines() if text.startswith("made up"))
-    # 14 of 18 frames were valid, now all are; the first was frame 6 or 1: the median over two scenes 3.5, now 1.
-    assert "77.8 → 100.0" in row and "3.5 → 1" in row
-    assert "old → new" in page and "valid in both 14, only before 0, only after 4, in neither 0" in page
-    assert "NOT THE SAME images or limits in 1 scenes" in page and "1 scenes only here" in page
-    assert "no scene of the other file" in as_text(after, [line(seed=2)])
-
-
-def test_finished_scenes_of_other_code_are_not_continued(tmp_path: Path):
-    from benchmarks.integrity import append_line, read_lines
-
-    state = tmp_path / "state.jsonl"
-    append_line(state, {**line(), "code": "one", "seconds": 1.0})
-    append_line(state, {**line(), "code": "two", "seconds": 2.0})
-    assert [each["seconds"] for each in read_lines(state, "one").values()] == [1.0]
-    assert [each["seconds"] for each in read_lines(state).values()] == [2.0]
-    assert read_lines(state, "three") == {} and read_lines(None) == {}
 
 
 @pytest.mark.parametrize(
@@ -305,50 +249,6 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
 
     covariance = np.diag([1e-10, 4e-10, 1e-12, 1.0, 1.0, 1.0])
     assert normal_level_m(covariance, 1e-5) == pytest.approx(4.417 * 2e-5, rel=1e-3)
-
-
-@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
-def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
-    from benchmarks.integrity_draft import Fingers
-    from benchmarks.integrity_practice import CONDITIONS
-    from benchmarks.integrity_scenes import make_integrity_scene
-    from benchmarks.outline_seen import outline_seen
-
-    assert len({condition.name for condition in CONDITIONS}) == len(CONDITIONS)
-    for condition in CONDITIONS:
-        for number in range(4):
-            scene = make_integrity_scene(condition, 5, number, 96)
-            simulator, first = scene.simulator, scene.first
-            assert 15.0 <= simulator.scenario.fps <= 30.0
-            if not first:
-                seen = [outline_seen(simulator, index) for index in (0, 14)]
-                free = condition.fingers is not Fingers.SHORT  # of which the border cuts off the tips' far edges
-                assert all(s.tips.min() > (0.99 if free else 0.3) and s.edges.min() > 0.99 for s in seen), (
-                    condition.name
-                )
-            truth = simulator.truth(first)
-            assert 0.0 < np.linalg.norm(scene.start_cam_T_grip[:3, 3] - truth.cam_T_grip[:3, 3]) < 6e-4
-            again = make_integrity_scene(condition, 5, number, 96)
-            assert again.simulator.scenario == simulator.scenario
-            assert np.array_equal(again.simulator.truth(40).cam_T_grip, simulator.truth(40).cam_T_grip)
-
-
-@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
-def test_conditions_hide_what_they_say():
-    from benchmarks.integrity_practice import CONDITIONS
-    from benchmarks.integrity_runs import View, _view
-    from benchmarks.integrity_scenes import make_integrity_scene
-
-    by_name = {condition.name: condition for condition in CONDITIONS}
-
-    def share(name: str, view: View) -> float:
-        scenes = [make_integrity_scene(by_name[name], 3, number, 96) for number in range(10)]
-        return float(np.mean([_view(scene, 48 if not scene.first else scene.first) is view for scene in scenes]))
-
-    assert share("ordinary", View.FREE) == share("mirror", View.FREE) == share("rim beside", View.FREE) == 1.0
-    assert share("box over one", View.ONE_TIP) > 0.6
-    assert share("rim over tips", View.NO_TIP) > 0.5 and share("big grasp", View.NO_TIP) > 0.6
-    assert share("grasp", View.BOTH_TIPS) > 0.6
 
 
 @pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")

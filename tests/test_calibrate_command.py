@@ -196,22 +196,6 @@ def test_blurred_and_parallel_images_are_refused(tmp_path: Path, capsys: pytest.
     assert not out.exists()
 
 
-def test_a_file_that_cannot_be_written_leaves_nothing(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """The disk fills while the file is written: the old one stays, and no part of the new one."""
-    out = tmp_path / "camera.yaml"
-    out.write_text("mine\n")
-
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("gripmon.model.atomic.os.fsync", full)
-    assert calibrate(*images(folder), "--target", TEXT, "--out", str(out), "--force") == 2
-    assert capsys.readouterr().err == f"--out {out}: can't be written (No space left on device); a file\n"
-    assert out.read_text() == "mine\n" and [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]
-
-
 def test_a_target_that_is_described_too_large_is_doubted(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -32,7 +32,7 @@ def stated(text: str) -> float:
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
 @pytest.mark.parametrize("outliers", [0, 4])
-@pytest.mark.parametrize("size_m", [1.5e-4, 3e-4, 1.5e-3])
+@pytest.mark.parametrize("size_m", [1.5e-4, 1.5e-3])
 def test_a_bent_finger_is_named_never_the_camera(size_m: float, outliers: int, lens: LensSettings):
     for seed, (finger, x, y) in enumerate([("left", 1.0, 0.0), ("right", 0.0, 1.0), ("left", -0.6, 0.8)]):
         shown = Shown(sharp_gripper(), lens, seed)
@@ -63,7 +63,7 @@ def test_a_camera_that_moved_is_named(shift_m: Any, turn_deg: Any, outliers: int
     assert "would look the same" in text
 
 
-@pytest.mark.parametrize("wrong_m", [2e-4, -5e-4, 2e-3])
+@pytest.mark.parametrize("wrong_m", [2e-4, -5e-4])
 @pytest.mark.parametrize("sigma_m", [0.0, 5e-5])
 def test_a_wrong_report_of_the_opening_is_named(wrong_m: float, sigma_m: float):
     shown = Shown(sharp_gripper())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -60,9 +59,6 @@ def test_a_session_that_cannot_be_opened(
 
 
 @pytest.mark.parametrize(
-    "package", ["rosbags", pytest.param("xxhash", marks=pytest.mark.slow("the other package is in the default run"))]
-)
-@pytest.mark.parametrize(
     ("sections", "key"),
     [
         ({"source": {"kind": "zenoh", "topic": "/image", "format": "ros2_image"}}, "source.format"),
@@ -73,12 +69,11 @@ def test_a_session_that_cannot_be_opened(
 def test_packages_that_are_missing(
     sections: dict[str, object],
     key: str,
-    package: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    for name in [package, *(each for each in sys.modules if each.startswith(f"{package}."))]:
+    for name in ["rosbags", *(each for each in sys.modules if each.startswith("rosbags."))]:
         monkeypatch.setitem(sys.modules, name, None)  # as Python notes a module that can't be had
     typestore.cache_clear()
     jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}
@@ -86,25 +81,6 @@ def test_packages_that_are_missing(
     assert f"config.yaml: {key}: " in line
     assert "; pip install -e '.[ros2]' in gripmon's checkout" in line
     typestore.cache_clear()
-
-
-@pytest.mark.slow("6 s: words; what cannot be joined is in the default run")
-def test_how_the_network_would_be_joined_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    def said(publish: dict[str, object]) -> str:
-        path = written(tmp_path, publish=publish)
-        assert main(["check", path, "--verbose"]) == 0
-        return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Zenoh"))
-
-    assert said({}).endswith("gripmon/demo/wrist/, peer, listens on tcp/127.0.0.1:7447")
-    assert said({"mode": "client", "connect": ["tcp/10.0.0.5:7447"]}).endswith("client, connects to tcp/10.0.0.5:7447")
-    (tmp_path / "quiet.json5").write_text('{mode: "peer", connect: {endpoints: ["tcp/10.0.0.6:7447"]}}')
-    assert said({"zenoh_config": "quiet.json5"}).endswith(
-        f"peer, connects to tcp/10.0.0.6:7447 (by {tmp_path / 'quiet.json5'})"
-    )
-    assert said({"enabled": False}).split() == ["Zenoh", "off"]
-    assert main(["check", written(tmp_path), "--json"]) == 0
-    zenoh = {"file": None, "mode": "peer", "listen": ["tcp/127.0.0.1:7447"], "connect": []}
-    assert json.loads(capsys.readouterr().out)["zenoh"] == zenoh
 
 
 @pytest.mark.parametrize(

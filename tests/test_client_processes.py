@@ -49,19 +49,6 @@ def test_a_killed_monitor_is_known_to_be_gone_whatever_age_is_allowed(endpoint: 
         assert gone.seq >= before.seq and gone.same_revision_as(before)
 
 
-def test_whoever_waits_for_the_next_reading_is_told_that_the_monitor_is_gone(endpoint: str):
-    with TransformClient("arm", connect=[endpoint], policy=PATIENT) as client:
-        told: list[Reading] = []
-        client.on_transform(told.append)
-        with remote_monitor(listen=[endpoint]) as monitor:
-            wait_until(lambda: told and told[-1].usable, "a usable reading")
-            monitor.send_signal(signal.SIGKILL)
-            wait_until(lambda: told[-1].why is Unusable.GONE, "the callback to be told")
-        # A monitor that takes its time to start is waited for, which is said once.
-        first = [reading for reading in told if reading.why in (Unusable.NOT_CONNECTED, Unusable.NOTHING_YET)]
-        assert len(first) <= 1 and all(reading.usable for reading in told[len(first) : -1])
-
-
 def test_a_stopped_monitors_transform_is_stale_and_usable_again(endpoint: str):
     """Its session stays, so that only the age tells."""
     with (
@@ -108,23 +95,6 @@ def test_a_router_that_is_killed_and_started_again_needs_no_help(endpoint: str, 
                 assert first.transform == second.transform
             refused(client, Unusable.GONE)
             refused(peer, Unusable.GONE)
-
-
-def test_a_second_camera_makes_nothing_usable_until_it_is_gone(endpoint: str):
-    second = free_endpoint()
-    with (
-        TransformClient("arm", connect=[endpoint, second], policy=PATIENT) as client,
-        TransformClient("arm", "elbow", connect=[endpoint, second], policy=PATIENT) as named,
-        remote_monitor(listen=[endpoint]),
-    ):
-        usable(client)
-        with remote_monitor(listen=[second], camera="elbow", answer={"revision": 8}):
-            both = refused(client, Unusable.SEVERAL)
-            assert both.reason == "more than one monitor is there: arm/elbow, arm/wrist; name the camera"
-            assert both.transform is None
-            assert usable(named).revision == 8 and named.latest().monitor == ("arm", "elbow")
-        refused(named, Unusable.GONE)
-        assert usable(client).monitor == ("arm", "wrist")
 
 
 _FLOOD = """
@@ -230,10 +200,3 @@ def test_a_program_that_forgets_to_close_its_client_ends(endpoint: str):
         [sys.executable, "-c", code, endpoint], capture_output=True, text=True, timeout=60.0, cwd=root
     )
     assert (done.returncode, done.stdout) == (0, "False\n") and "Traceback" not in done.stderr
-
-
-def test_no_thread_is_left(endpoint: str):
-    before = set(threading.enumerate())
-    with TransformClient("arm", connect=[endpoint]) as client:
-        client.on_transform(lambda _: None)
-    assert set(threading.enumerate()) <= before

@@ -231,7 +231,7 @@ def test_a_side_of_which_nothing_is_seen_is_not_seen_to_turn():
 # --- a monitor ---
 
 
-@pytest.mark.parametrize("radius_m", RADII_M)
+@pytest.mark.parametrize("radius_m", [0.002, 0.008])
 def test_round_tips_are_tracked_before_clutter(radius_m: float):
     """As exactly, within a factor of two, as sharp fingers of the same width and length, and within the bound."""
     scenario = make_scenario("clutter", duration_s=2.0, fps=FPS)
@@ -260,20 +260,18 @@ def test_a_knock_is_followed():
     assert valid(watched)[32:].mean() > 0.9 and np.nanmax(errors_m(watched)[30:]) < 3e-4
 
 
-@pytest.mark.parametrize("radius_m", [0.002, 0.004])
-def test_a_straight_rim_before_both_tips_is_not_taken_for_them(radius_m: float):
+def test_a_straight_rim_before_both_tips_is_not_taken_for_them():
     """A bar parallel to the tips, before their round part; the gripper is knocked along its fingers behind it."""
     plain = ObjectLook(pattern="plain", level_dn=120.0)
     bar = Prop(size_m=(0.2, 0.01, 0.03), centre_m=(0.0, -0.02, -0.010), look=plain, start_s=0.82)
     way = (-2e-3 * nominal_cam_T_grip()[:3, 2]).tolist()
     knock = Bump(at_s=1.22, ring_fraction=0.0, translation_m=(way[0], way[1], way[2]))
-    watched, _ = seen(radius_m, Scenario(name="bar", duration_s=2.0, fps=FPS, props=(bar,), mount=(knock,)))
+    watched, _ = seen(0.002, Scenario(name="bar", duration_s=2.0, fps=FPS, props=(bar,), mount=(knock,)))
     assert_no_valid_frame_is_beyond_its_bound(watched)
     assert not valid(watched)[25:].any()
 
 
-@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.012, 0.02), (-0.018, 0.04)])
-@pytest.mark.parametrize("radius_m", [0.0007, 0.001])
+@pytest.mark.parametrize(("radius_m", "z_m", "size_z_m"), [(0.0007, -0.010, 0.03), (0.001, -0.018, 0.04)])
 def test_tips_that_are_nearly_straight_prove_nothing_where_a_bar_goes_on_beside_them(
     radius_m: float, z_m: float, size_z_m: float
 ):

@@ -1,38 +1,27 @@
-"""The compiled fit against the same in NumPy: same points, same decisions, numbers equal to rounding."""
+"""What is compiled of a measurement: the same as Python runs it, and nothing is compiled while frames come."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.box_models import cube_model
-from support.by_numpy import fit as by_numpy
-from support.by_numpy import prediction as by_numpy_prediction
-from support.by_numpy import profiles as by_numpy_profiles
 from support.grippers import gripper_from_dict
 from support.meters import measure, meter, moved, picture
 from support.simulated import plain_scenario
-from test_golden import measured
 from test_robust_fit import (
     CAMERA,
     EDGES,
     GRIPPER,
-    PREDICTION,
     PRIOR,
-    SAMPLED,
     SETTINGS,
     XI,
     candidates,
-    true_candidates,
     votes_for,
-    with_background_edge,
-    with_clutter,
 )
 
 from gripmon.track.edges import (
@@ -46,43 +35,17 @@ from gripmon.track.edges import (
     prediction,
     prediction_kernel,
     profile_kernel,
-    robust_fit,
     settling,
     warm_up_fit,
     warm_up_geometry,
     warm_up_profiles,
 )
-from gripmon.track.edges.profiles import Edgels
-from gripmon.track.edges.robust_fit import RESTART_WIDTH_PX, Prior, assess, contradictions_without, fit_irls
+from gripmon.track.edges.robust_fit import Prior, assess, contradictions_without, fit_irls
 
 CLOSE = 1e-9
 
 
-def many_votes() -> list[Edgels]:
-    """Edges alone, in clutter, behind an edge of the background; with polarity, spreads and cut-off edges."""
-    rng = np.random.default_rng(21)
-    found = [true_candidates(rng, sigma) for sigma in (0.0, 0.05, 0.3)]
-    found += [with_clutter(rng, missing, extra) for missing in (0.0, 0.3, 0.8) for extra in (0.0, 0.5, 2.0)]
-    found += [with_background_edge(int(edge), 1.5, seen) for edge in SAMPLED[:4] for seen in (False, True)]
-    edgels = [votes_for(f) for f in found]
-    polarity = np.where(np.arange(EDGES) % 3 == 0, 1, 0).astype(np.int8)
-    for f in found:
-        mixed = replace(
-            f,
-            sigma_px=rng.uniform(0.02, 0.4, len(f.sample)),
-            step=rng.choice([-40.0, 40.0], len(f.sample), p=[0.2, 0.8]),
-            zoom=int(rng.choice([1, 2, 4])),
-        )
-        spread_px, cut_off_px = rng.uniform(0.0, 0.1, EDGES), rng.uniform(0.0, 0.2, EDGES)
-        edgels.append(replace(votes_for(mixed, polarity=polarity, edge_spread_px=spread_px), cut_off_px=cut_off_px))
-    return edgels
-
-
-VOTES = many_votes()
 NOTHING = votes_for(candidates(np.arange(0), np.zeros(0)))
-HARDLY = [votes_for(candidates(np.arange(count), np.full(count, 0.3))) for count in (3, 6)]
-RIGID = replace(PREDICTION, jacobian=np.ascontiguousarray(PREDICTION.jacobian[:, :6]))
-"""The same edges of a gripper without a jaw: six unknowns."""
 
 
 def prior(unknowns: int, jaw_sigma_m: float = 1e-4, opened_m: float = 0.0) -> Prior:
@@ -91,83 +54,16 @@ def prior(unknowns: int, jaw_sigma_m: float = 1e-4, opened_m: float = 0.0) -> Pr
     return Prior(np.array([0.0] * 6 + [opened_m])[:unknowns], information)
 
 
-def cases() -> Iterator[tuple[Edgels, Prior, np.ndarray]]:
-    rng = np.random.default_rng(22)
-    for edgels in (*VOTES, *HARDLY, NOTHING):
-        for start in (np.zeros(7), 0.5 * XI, XI + rng.normal(size=7) * [2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3, 1e-4]):
-            yield edgels, prior(7), start
-        yield edgels, prior(7, 1e-6, 2e-5), np.zeros(7)
-        yield edgels, prior(7, 0.02), np.zeros(7)
-        yield replace(edgels, prediction=RIGID), prior(6), np.zeros(6)
-
-
-def assert_alike(one: object, other: object, unit: np.ndarray, condition: float) -> None:
-    """Every field of two records: decisions equal, numbers within :data:`CLOSE` of the largest in their field.
-
-    ``unit`` (m,) makes the unknowns comparable with each other: by how much they are uncertain.  ``condition`` of the
-    normal matrix in these units: rounding grows with it where a handful of points hardly determines the motion.
-    """
-    close = CLOSE * max(1e-4 * condition, 1.0)
-    scale = {
-        "xi": 1.0 / unit,
-        "pull": unit,
-        "information": np.outer(unit, unit),
-        "middle": np.outer(unit, unit),
-        "covariance": 1.0 / np.outer(unit, unit),
-    }
-    for field in fields(one):  # type: ignore[arg-type]
-        if field.name == "normal":
-            assert_alike(one.normal, other.normal, unit, condition)  # type: ignore[attr-defined]
-            continue
-        left, right = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
-        assert left.shape == right.shape and left.dtype == right.dtype, field.name
-        if left.dtype.kind == "f":
-            by = scale.get(field.name, 1.0)
-            most = close * max(float(np.abs(right * by).max(initial=0.0)), 1e-3)
-            np.testing.assert_allclose(left * by, right * by, rtol=0.0, atol=most, err_msg=field.name)
-        else:
-            np.testing.assert_array_equal(left, right, err_msg=field.name)
-
-
-def test_the_compiled_fit_and_covariance_are_those_of_numpy():
-    for edgels, known, start in cases():
-        expected = by_numpy.fit_irls(edgels, known, start, SETTINGS)
-        assert_same_fit(edgels, known, start, None)
-        assert_same_fit(edgels, known, expected.xi, RESTART_WIDTH_PX)
-
-
-def assert_same_fit(edgels: Edgels, known: Prior, start: np.ndarray, width_px: float | None) -> None:
-    expected = by_numpy.fit_irls(edgels, known, start, SETTINGS, width_px)
-    unit = 1.0 / np.sqrt(np.diag(expected.information) + known.information)
-    normal = expected.information + np.diag(known.information)
-    condition = float(np.linalg.cond(normal * np.outer(unit, unit)))
-    assert_alike(fit_irls(edgels, known, start, SETTINGS, width_px), expected, unit, condition)
-    for shared_px in (0.0, 0.2):
-        one, other = (f(edgels, expected, known.information, shared_px) for f in (assess, by_numpy.assess))
-        assert_alike(one, other, unit, condition)
-
-
-def test_the_compiled_fits_without_one_edge_are_those_of_numpy():
-    for edgels, known, start in list(cases())[::7]:
-        stays = contradictions_without(edgels, known, start, SETTINGS)
-        expected = by_numpy.contradictions_without(edgels, known, start, SETTINGS)
-        assert len(stays) == len(SAMPLED)
-        np.testing.assert_allclose(stays, expected, rtol=1e-8)
-
-
 def test_what_can_not_be_solved_is_an_error():
     """No candidates and a prior that holds nothing: all of these have a normal matrix of zeros."""
     nothing = Prior(np.zeros(7), np.zeros(7))
-    for fit in (fit_irls, by_numpy.fit_irls):
-        with pytest.raises(FloatingPointError, match="not positive definite"):
-            fit(NOTHING, nothing, np.zeros(7), SETTINGS)
+    with pytest.raises(FloatingPointError, match="not positive definite"):
+        fit_irls(NOTHING, nothing, np.zeros(7), SETTINGS)
     empty = fit_irls(NOTHING, prior(7), np.zeros(7), SETTINGS)
-    for covariance in (assess, by_numpy.assess):
-        with pytest.raises(FloatingPointError, match="not positive definite"):
-            covariance(NOTHING, empty, np.zeros(7))
-    for without in (contradictions_without, by_numpy.contradictions_without):
-        with pytest.raises(FloatingPointError, match="not positive definite"):
-            without(NOTHING, nothing, np.zeros(7), SETTINGS)
+    with pytest.raises(FloatingPointError, match="not positive definite"):
+        assess(NOTHING, empty, np.zeros(7))
+    with pytest.raises(FloatingPointError, match="not positive definite"):
+        contradictions_without(NOTHING, nothing, np.zeros(7), SETTINGS)
 
 
 def test_what_is_read_off_a_measurement_is_what_numpy_reads():
@@ -228,7 +124,6 @@ def test_after_warming_up_no_frame_waits_for_the_compiler():
         agreeing_fingers(found, GRIPPER)
         edge_residuals_px(found, GRIPPER)
         measure(image, using=FingertipMeter(CAMERA, gripper_from_dict(cube_model()), MeasurementSettings(), 0.0))
-    contradictions_without(VOTES[4], prior(7), np.zeros(7), SETTINGS)
     assert signatures() == before
 
 
@@ -258,24 +153,3 @@ def test_what_is_compiled_measures_as_it_is_written():
     one, other = found
     assert len(one) > 60
     np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-24)
-
-
-def test_numpy_measures_the_same(monkeypatch: pytest.MonkeyPatch):
-    """A whole measurement in a cluttered image: pose to a picometre, corners to a millionth of a pixel."""
-    one, _ = measured("clutter")
-    for module, name, by in (
-        (prediction, "prediction_kernel", by_numpy_prediction),
-        (settling, "read_profiles", by_numpy_profiles.read_profiles),
-        (settling, "find_candidates", by_numpy_profiles.find_candidates),
-        (settling, "weigh", by_numpy_profiles.weigh),
-        (settling, "fit_irls", by_numpy.fit_irls),
-        (robust_fit, "fit_irls", by_numpy.fit_irls),
-        (settling, "assess", by_numpy.assess),
-    ):
-        monkeypatch.setattr(module, name, by)
-    other, _ = measured("clutter")
-    assert not np.array_equal(one.cam_T_grip, other.cam_T_grip), "the same code twice"
-    np.testing.assert_allclose(one.cam_T_grip, other.cam_T_grip, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(one.cam_T_grip[:3, 3], other.cam_T_grip[:3, 3], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-20)
-    np.testing.assert_allclose(one.corners.uv_px, other.corners.uv_px, rtol=0.0, atol=1e-6)

@@ -303,18 +303,3 @@ def test_row_groups_let_readers_skip_by_time(tmp_path: Path, monkeypatch: pytest
     assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [64, 64, 64, 8]
     stamps = [about.row_group(i).column(SCHEMAS["frames"].names.index("stamp_ns")).statistics for i in range(4)]
     assert all(before.max < after.min for before, after in itertools.pairwise(stamps))
-
-
-def test_a_fault_leaves_the_file_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    export(tmp_path, Run(moving(5)))
-    name = tmp_path / "frames" / files(tmp_path)[0]
-    before = name.read_bytes()
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("gripmon.model.atomic.os.fsync", full)
-        with pytest.raises(OSError, match="No space left"):
-            export(tmp_path, Run(moving(50)))
-    assert name.read_bytes() == before and len(files(tmp_path)) == 1

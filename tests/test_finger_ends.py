@@ -85,7 +85,7 @@ def test_in_free_view_both_fingers_show_their_ends(scenario: Scenario):
     np.testing.assert_array_equal(ends.might, [3, 3])
 
 
-@pytest.mark.parametrize("blur_px", [0.4, 1.1, 1.8])
+@pytest.mark.parametrize("blur_px", [0.4, 1.8])
 def test_the_ends_are_seen_with_any_edge_filter_that_the_search_lines_hold(blur_px: float):
     using, image = meter(settings=MeasurementSettings(edges=EdgeSettings(blur_px=blur_px))), picture(PLAIN)
     assert using.ends(image, measure(image, nominal_cam_T_grip(), using=using)).sure
@@ -102,8 +102,8 @@ def test_one_finger_with_its_end_hidden_proves_nothing_and_the_other_one_is_seen
 # --- what only looks like the ends ---
 
 
-@pytest.mark.parametrize("level_dn", [30.0, 120.0, 230.0])
-@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.012, 0.02), (-0.018, 0.04)])
+@pytest.mark.parametrize("level_dn", [30.0, 230.0])
+@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.018, 0.04)])
 def test_a_bar_before_the_tips_with_its_rim_parallel_to_them_proves_nothing(
     z_m: float, size_z_m: float, level_dn: float
 ):
@@ -116,7 +116,7 @@ def test_a_bar_before_the_tips_with_its_rim_parallel_to_them_proves_nothing(
 
 
 @pytest.mark.parametrize("scenario", [PLAIN, Scenario(name="usual", duration_s=1.0)], ids=["plain", "usual"])
-@pytest.mark.parametrize("slide_m", [-9e-3, -6e-3, -4.5e-3, 3e-3, 4.5e-3, 6e-3, 9e-3])
+@pytest.mark.parametrize("slide_m", [-9e-3, -4.5e-3, 3e-3, 9e-3])
 def test_a_pose_that_slid_along_the_fingers_is_not_proven(scenario: Scenario, slide_m: float):
     """Most edges agree there; the fingers go on beyond where it has their ends, or end before."""
     found, ends = looked_at(scenario, slide_m)
@@ -124,8 +124,8 @@ def test_a_pose_that_slid_along_the_fingers_is_not_proven(scenario: Scenario, sl
     assert not ends.sure and ends.seen.max() < 2
 
 
-@pytest.mark.parametrize("gain", [0.5, 0.7, 2.0])
-@pytest.mark.parametrize("from_tip_m", [0.004, 0.006, 0.009])
+@pytest.mark.parametrize("gain", [0.7, 2.0])
+@pytest.mark.parametrize("from_tip_m", [0.004, 0.009])
 def test_where_a_tone_of_the_fingers_begins_is_not_their_end(from_tip_m: float, gain: float):
     """The slid pose shows corners there, and its tip edges; that the edges along the fingers go on gives it away."""
     scenario = toned(from_tip_m, gain)

@@ -126,14 +126,6 @@ def test_the_readme_shows_commands_of_the_tutorial_and_what_they_print(tutorial:
     assert rest == [command for command in tutorial.printed if command in rest], "and files, too"
 
 
-@pytest.mark.slow("100 s; the same commands, as the tutorial has them, are in the default run")
-def test_the_readme_is_walked_by_itself(tmp_path: Path):
-    folder = walk("README.md", tmp_path).folder
-    test_the_camera_is_the_true_one(folder)
-    test_gripper_and_hand_eye_are_the_true_ones(folder)
-    test_the_knock_is_noticed_and_measured(folder)
-
-
 def test_the_camera_is_the_true_one(walked: Path):
     found, true = read(walked / "camera.yaml"), read(walked / "plate" / "truth.json")["camera"]
     off = np.array([found["camera"][name] - true[name] for name in found["parameters"]])

@@ -210,14 +210,11 @@ def test_an_open_surface_is_taken_and_said(tmp_path: Path):
     assert away[corner].max() < 2 * MICROMETRE
 
 
-@pytest.mark.parametrize(
-    "halvings", [6, pytest.param(8, marks=pytest.mark.slow("20 s; a sixteenth of the triangles is in the default run"))]
-)
-def test_a_million_triangles_take_seconds_and_give_the_same_edges(tmp_path: Path, halvings: int):
+def test_many_triangles_give_the_same_edges(tmp_path: Path):
     mesh = box_meshes(sharp_gripper())[0]
-    for _ in range(halvings):
+    for _ in range(5):
         mesh = mesh.subdivide()
-    assert len(mesh.faces) == 12 * 4**halvings
+    assert len(mesh.faces) == 12 * 4**5
     (path,) = write_meshes([mesh], tmp_path)
     made = gripper_from_cad([path], unit="mm").gripper
     few = gripper_from_cad(write_meshes(box_meshes(sharp_gripper())[:1], tmp_path), unit="mm").gripper

@@ -31,15 +31,12 @@ from tools.benchmarks.meshes import (
     write_meshes,
 )
 
-FRAMES, FEW = 45, 24
-BETWEEN = pytest.mark.slow("5 s each: other radii and shades; the smallest is in the default run, as are all ends")
-ROUNDED_M = (0.002, pytest.param(0.004, marks=BETWEEN), 0.008)
+FRAMES, FEW = 36, 24
+ROUNDED_M = (0.002, 0.008)
 
 SHAPES = {
     "box": (box_fingers, (15e-6, 60e-6)),
     "2 mm": (lambda: rounded_fingers(0.002), (45e-6, 120e-6)),
-    "4 mm": (lambda: rounded_fingers(0.004), (45e-6, 120e-6)),
-    "8 mm": (lambda: rounded_fingers(0.008), (45e-6, 120e-6)),
     "curved": (curved_fingers, (15e-6, 60e-6)),
 }
 """Meshes by name, and what 95 % of the frames' errors keep across and along the optical axis, m."""
@@ -72,7 +69,7 @@ def seen(
     return record, error
 
 
-@pytest.mark.parametrize("shape", [pytest.param(s, marks=BETWEEN) if s in ("4 mm", "8 mm") else s for s in SHAPES])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_what_was_made_from_a_mesh_tracks_it(shape: str, tmp_path: Path):
     """The camera wanders by 0.2 mm and 1 mrad, the jaws by 1 mm, and each frame has another background."""
     meshes, (across_m, along_m) = SHAPES[shape][0](), SHAPES[shape][1]
@@ -119,7 +116,7 @@ def test_rounded_ends_are_seen_where_they_are_and_nowhere_else(radius_m: float, 
     """Started anywhere along the fingers, also where the fit has half come back from there."""
     gripper, pictures = rounded(radius_m, tmp_path)
     using, sure = meter(gripper), 0
-    for seed in range(3):
+    for seed in range(2):
         image = pictures.picture(nominal_cam_T_grip())
         for slide_m in np.linspace(-9e-3, 9e-3, 25).tolist():
             found = measure(image, slid(slide_m), using=using, jaw_opening_m=gripper.jaw_nominal_m)
@@ -127,17 +124,10 @@ def test_rounded_ends_are_seen_where_they_are_and_nowhere_else(radius_m: float, 
             off_m = float(np.linalg.norm(found.cam_T_grip[:3, 3] - nominal_cam_T_grip()[:3, 3]))
             sure += ends.sure
             assert off_m < 1e-4 or (not ends.sure and ends.seen.max() < 2), (seed, slide_m)
-    assert sure > 15
+    assert sure > 10
 
 
-@pytest.mark.parametrize(
-    ("radius_m", "level_dn"),
-    [
-        pytest.param(radius_m, level_dn, marks=() if k == m else BETWEEN)
-        for k, radius_m in enumerate((0.002, 0.004, 0.008))
-        for m, level_dn in enumerate((30.0, 120.0, 230.0))
-    ],
-)
+@pytest.mark.parametrize(("radius_m", "level_dn"), [(0.002, 30.0), (0.008, 230.0)])
 def test_a_bar_before_or_behind_rounded_tips_is_not_taken_for_them(radius_m: float, level_dn: float, tmp_path: Path):
     gripper, pictures = rounded(radius_m, tmp_path)
     using = meter(gripper)
@@ -152,10 +142,9 @@ def test_a_bar_before_or_behind_rounded_tips_is_not_taken_for_them(radius_m: flo
             assert off_m < 1e-4 or (not ends.sure and ends.seen.max() < 2), (things.keys(), slide_m)
 
 
-@pytest.mark.parametrize("radius_m", ROUNDED_M)
-def test_a_knock_along_rounded_fingers_behind_a_bar_is_never_valid_beyond_its_bound(radius_m: float, tmp_path: Path):
+def test_a_knock_along_rounded_fingers_behind_a_bar_is_never_valid_beyond_its_bound(tmp_path: Path):
     """The bar's rim lies where the tips were; then the gripper is knocked by 2 mm along its fingers, and seen free."""
-    gripper, pictures = rounded(radius_m, tmp_path)
+    gripper, pictures = rounded(0.002, tmp_path)
     monitor, valid = watch_of(gripper), []
     before = [(bar(-0.03, 0.004, -0.02), 120.0)]
     for k in range(60):
@@ -214,7 +203,7 @@ def promised(
     return Promised(valid > 0.0, error_m, bound_m)
 
 
-@pytest.mark.parametrize("real_m", [1e-4, 2e-4, 3e-4])
+@pytest.mark.parametrize("real_m", [1e-4, 3e-4])
 def test_an_untaught_gripper_from_cad_allows_for_real_bevels(real_m: float, tmp_path: Path):
     """They look like half a millimetre of distance and more.  No frame is valid by it, valid or not none is beyond."""
     gripper = from_meshes(box_fingers(), tmp_path)

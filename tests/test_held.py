@@ -25,10 +25,7 @@ PERIOD_S = 0.05
 WHOLE, HIDDEN, AGAIN = 6, 26, 8  # frames in which all shows, in which something is hidden, and after that
 GATE = 22.46  # 99.9 % of chi-square with six degrees of freedom
 
-MEASUREMENTS = [
-    "edges",
-    pytest.param("corners", marks=pytest.mark.slow("2 s each; by edges, as it comes, is in the default run")),
-]
+MEASUREMENTS = ["edges"]
 
 Mask = Callable[[np.ndarray], None]
 
@@ -179,21 +176,3 @@ def test_whatever_shows_the_covariance_covers_the_error(mask: Mask, measurement:
             assert np.abs(error_of(record)[:3]).max() < 2e-4
         if record.source is Origin.UPDATE:
             assert (covariance_of(record).diagonal()[:3] > covariance_of(records[WHOLE - 1]).diagonal()[:3]).any()
-
-
-@pytest.mark.slow("5 s: by corners; by edges, as it comes, is in the default run")
-@pytest.mark.parametrize(("mask", "corners"), [(far_parts, 2), (tips, 4)], ids=["two corners", "four on a line"])
-def test_corners_that_do_not_determine_the_motion_leave_it_to_the_edges(mask: Mask, corners: int):
-    by_corners, by_edges = (run(mask, measurement)[WHOLE:] for measurement in ("corners", "edges"))
-    measured = 0
-    for one, other in zip(by_corners, by_edges, strict=True):
-        assert one.source is other.source
-        if one.source is not Origin.UPDATE:
-            continue
-        measured += 1
-        assert sum(c.used for c in one.corners) == corners
-        # Both start from what the frame before gave, and end at the same place within the fit's own tolerance.
-        apart = error_of(one) - error_of(other)
-        assert apart @ np.linalg.solve(covariance_of(other), apart) < 0.25
-        np.testing.assert_allclose(covariance_of(one).diagonal(), covariance_of(other).diagonal(), rtol=0.3)
-    assert measured > HIDDEN // 2

@@ -63,7 +63,7 @@ def normal_equations(rng: np.random.Generator, m: int) -> tuple:
 
 
 @pytest.mark.parametrize("m", [6, 7])
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(2))
 def test_fits_are_those_of_numpy(m: int, seed: int):
     rng = np.random.default_rng(seed)
     of = normal_equations(rng, m)
@@ -82,7 +82,7 @@ def test_fits_are_those_of_numpy(m: int, seed: int):
         np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(2))
 def test_averages_are_those_of_numpy(seed: int):
     rng = np.random.default_rng(seed)
     average, frame, at, wander = fits(rng), fits(rng), shifts(rng, 1)[0], rng.uniform(size=6) * SIZE[:6] ** 2
@@ -101,7 +101,7 @@ def test_averages_are_those_of_numpy(seed: int):
     agree((kernel.squares(*of),), (by_numpy.squares(*of),))
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(2))
 def test_jumps_are_those_of_numpy(seed: int):
     rng = np.random.default_rng(seed)
     frame, at, known, jumps = fits(rng), shifts(rng, 1)[0], covariances(rng, 1)[0], 3.0 * covariances(rng, 4)
@@ -209,7 +209,7 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
     return [monitor.process(simulator.frame(k)) for k in range(30)]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, seed: int):
     found, expected = records(kernel, monkeypatch, seed), records(by_numpy, monkeypatch, seed)
     assert {record.verdict for record in expected} >= {"valid", "suspect"}

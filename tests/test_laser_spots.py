@@ -36,12 +36,9 @@ def rms(values):
 @pytest.mark.parametrize(
     ("limit_px", "options"),
     [
-        (0.05, {}),
         (0.06, {"height": 1500.0}),  # a core of twelve pixels that is saturated
-        (0.05, {"colour": True}),
-        (0.05, {"dtype": np.uint16}),
+        (0.05, {"colour": True, "dtype": np.uint16}),
         (0.12, {"height": 60.0}),
-        (0.05, {"sigma_px": 1.2}),
         (0.2, {"sigma_px": 7.0}),
         (0.7, {"speckle": 0.6}),
         (0.15, {"cluttered": True, "off": True}),
@@ -52,9 +49,9 @@ def test_the_spot_is_found_to_a_part_of_a_pixel(limit_px, options):
     assert rms(found) < limit_px
 
 
-@pytest.mark.parametrize("options", [{"speckle": 0.4}, {"speckle": 0.8, "sigma_px": 5.0}, {"height": 60.0}])
+@pytest.mark.parametrize("options", [{"speckle": 0.8, "sigma_px": 5.0}, {"height": 60.0}])
 def test_the_covariance_says_how_wrong_it_is_within_a_factor(options):
-    found, covariances = errors(60, **options)
+    found, covariances = errors(40, **options)
     size = np.einsum("ni,nij,nj->n", found, np.linalg.inv(covariances), found) / 2.0
     # Standard deviations within a factor of two: one spot's own speckle says no more.
     assert 0.25 < np.median(size) / 0.693 < 4.0

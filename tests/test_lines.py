@@ -108,11 +108,6 @@ def test_lines_and_code_as_counted_by_hand(counting: ModuleType, name: str, text
     assert (found.files, found.lines, found.code) == (1, lines, code)
 
 
-@pytest.mark.parametrize("name", ["a.yaml", "a.json", "a.md", "a.rrd", "bench", "a.sh", "a.cpp"])
-def test_data_documents_and_scripts_are_not_counted(counting: ModuleType, name: str):
-    assert counting.count(name, PYTHON) is None
-
-
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A repository with one commit, and more in its folder."""
@@ -159,23 +154,6 @@ def test_rooms_of_the_folder_as_it_is(counting: ModuleType, checkout: Path, caps
     assert rows["tools"][:3] == ["1", str(PYTHON_LINES), str(PYTHON_CODE)]
     assert rows["tests"][:3] == ["0", "0", "0"]
     assert rows["model"][3] == "3,600"
-
-
-def test_before_and_after(counting: ModuleType, checkout: Path, capsys: pytest.CaptureFixture[str]):
-    rows = table(counting, checkout, capsys, "--against", "HEAD")
-    before, now = PYTHON_LINES + JAVASCRIPT_LINES, 2 * PYTHON_LINES
-    assert rows["model"][1:4] == [str(before), str(now), f"{now - before:+}"]
-    before, now = PYTHON_CODE + JAVASCRIPT_CODE, 2 * PYTHON_CODE
-    assert rows["model"][4:7] == [str(before), str(now), f"{now - before:+}"]
-    assert rows["belief"][1:4] == ["0", str(HTML_LINES), f"+{HTML_LINES}"]
-    assert rows["tools"][3] == "+0"
-
-
-def test_a_commit_that_is_none(counting: ModuleType, checkout: Path, capsys: pytest.CaptureFixture[str]):
-    assert counting.main(["--against", "nonsense"], checkout) == 2
-    assert capsys.readouterr().err.strip() == (
-        "tools/lines: --against nonsense: no commit of this checkout; a hash, a branch or a tag"
-    )
 
 
 def test_the_rooms_aims_are_the_packages(counting: ModuleType):

@@ -11,12 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from support.frame_feeder import FORMATS
 from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
-from support.router_process import plain_config, running
 
 from gripmon.cli import main
 from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, type_hash
@@ -86,10 +83,6 @@ def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, Netwo
     [
         "raw",
         "ros2_image",
-        *(
-            pytest.param(each, marks=pytest.mark.slow("8 s: how it is decoded is in test_network_payload"))
-            for each in ("raw_padded", "png", "ros2_compressed")
-        ),
     ],
 )
 def test_lossless_frames_give_the_transforms_of_the_files(
@@ -99,20 +92,6 @@ def test_lossless_frames_give_the_transforms_of_the_files(
     assert len({line["jaw_opening_m"] for line in lines}) > FRAMES // 2, "the jaw's opening comes with each frame"
     assert lines == replayed
     assert "0 refused, 0 dropped" in daemon.said() and "malformed" not in daemon.said()
-
-
-@pytest.mark.slow("7 s; lossless frames over the network are in the default run")
-def test_jpeg_is_close(sequence: Path, replayed: Lines, tmp_path: Path):
-    lines, _ = fed(sequence, tmp_path, "jpeg")
-    assert len(lines) == len(replayed)
-    for line, other in zip(lines, replayed, strict=True):
-        assert line["stamp_ns"] == other["stamp_ns"] and line["verdict"] == other["verdict"]
-        here, there = (np.array(each["cam_T_grip"]["translation_m"]) for each in (line, other))
-        assert 0.0 < np.linalg.norm(here - there) < 1e-4, "another image, but of the same scene"
-
-
-def test_all_formats_are_tried():
-    assert set(FORMATS) == {"raw", "raw_padded", "png", "jpeg", "ros2_image", "ros2_compressed"}
 
 
 @contextmanager
@@ -150,24 +129,3 @@ def test_a_driver_that_is_killed_is_missed_and_welcome_again(sequence: Path, tmp
             wait_until(lambda: state_of(endpoint)["camera_connected"] is False, "the camera to be missed")
         assert daemon.stop() == 0
         assert "Traceback" not in daemon.said()
-
-
-@pytest.mark.slow("9 s; a driver that is killed and comes back is in the default run")
-def test_a_router_may_restart_in_the_middle(sequence: Path, tmp_path: Path):
-    """Driver and daemon are its clients.  No one is helped: both find it again."""
-    endpoint = free_endpoint()
-    config = network_config(sequence, f"{{mode: client, connect: [{endpoint}]}}", name="client")
-    with running(plain_config(tmp_path, endpoint), endpoint) as router, network_daemon(config, tmp_path) as daemon:
-        with feeding(sequence, endpoint, "--fps", "10") as driver:
-            wait_until(lambda: state_of(endpoint).get("frames", 0) > 5, "frames through the router")
-            router.kill()
-            daemon.await_saying("no frames: gripmon/simulated/wrist/image is silent")
-            router.start()
-            wait_until(lambda: state_of(endpoint).get("camera_connected") is True, "frames again", 60.0)
-            before = state_of(endpoint)["frames"]
-            wait_until(lambda: state_of(endpoint).get("frames", 0) > before + 5, "more of them")
-            driver.send_signal(signal.SIGINT)
-            _, said = driver.communicate(timeout=120.0)
-            assert driver.returncode == 130 and b"Traceback" not in said
-        assert daemon.stop() == 0
-        assert "Traceback" not in daemon.said() and "malformed" not in daemon.said()

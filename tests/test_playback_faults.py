@@ -74,7 +74,7 @@ def message_of(path: Path, entity: bytes, number: int) -> tuple[int, int]:
     return next((offset, size) for _, offset, size in messages(path.read_bytes()) if offset == offsets[number])
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("share", [0.1, 0.9])
 def test_cut_in_the_middle_of_a_message(run: Run, tmp_path: Path, share: float):
     """What is there is exactly what lies in whole messages before the cut."""
     data = run.files[0].read_bytes()
@@ -97,7 +97,7 @@ def test_cut_in_the_middle_of_a_message(run: Run, tmp_path: Path, share: float):
 def test_cut_anywhere_never_raises(run: Run, tmp_path: Path):
     size = run.files[0].stat().st_size
     counts = []
-    for end in [1, 5, 11, 12, 13, 27, 28, 100, 500, 5000, *np.linspace(6000, size - 1, 12).astype(int).tolist()]:
+    for end in [1, 5, 11, 12, 13, 27, 28, 100, 500, 5000, *np.linspace(6000, size - 1, 6).astype(int).tolist()]:
         collection = open_recordings([tampered(run, tmp_path, slice(0, end))])
         said = [*collection.faults, *(fault for r in collection.recordings for fault in r.faults)]
         assert said and all(fault.startswith(str(tmp_path)) and "\n" not in fault for fault in said)
@@ -141,7 +141,7 @@ def test_random_damage_never_raises_and_loses_nothing_silently(run: Run, tmp_pat
     """Bytes overwritten and cut out anywhere, in a process that native code would end if it were given them."""
     rng = np.random.default_rng(20)
     whole = run.files[0].read_bytes()
-    for _ in range(40):
+    for _ in range(16):
         data = bytearray(whole)
         at = int(rng.integers(0, len(data)))
         if rng.random() < 0.7:

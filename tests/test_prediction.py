@@ -13,6 +13,7 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.gripper import Gripper
+from gripmon.model.gripper.motion import offset_m
 from gripmon.track.edges.lines import CornerGeometry
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
@@ -246,3 +247,13 @@ def test_a_fit_that_leads_out_of_the_lens_is_only_a_bad_fit(seed: int):
     tcp_m = (*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.005, 0.02))
     found = measure(image, nominal_cam_T_grip(tilt_deg, tcp_m), using=meter(lens=WIDE_LENS))
     assert not found.trusted and np.isfinite(found.prediction.uv_px).all()
+
+
+def test_a_finger_is_where_its_table_has_it():
+    """Against NumPy's own interpolation, at the table's rows and between them; beyond its ends it goes on straight."""
+    table = np.array([[0.0, 0.0, 0.1, 0.2], [0.01, 1.0, 0.0, 0.3], [0.04, 4.0, -0.5, 0.1], [0.05, 3.0, 0.0, 0.0]])
+    np.testing.assert_allclose(offset_m(table, -0.01), [-1.0, 0.2, 0.1], atol=1e-15)
+    np.testing.assert_allclose(offset_m(table, 0.07), [1.0, 1.0, -0.2], atol=1e-14)
+    for opening_m in (0.0, 0.003, 0.01, 0.0399, 0.04, 0.05):
+        expected = [np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)]
+        np.testing.assert_allclose(offset_m(table, opening_m), expected, atol=1e-15)

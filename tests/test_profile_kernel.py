@@ -1,21 +1,14 @@
-"""The compiled sampler and its candidates against the same in NumPy, and against OpenCV's own interpolation."""
+"""The compiled sampler against OpenCV's own interpolation; what is found in its profiles: test_edge_profiles.py."""
 
 from __future__ import annotations
-
-from dataclasses import fields, replace
 
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from support.by_numpy import profiles as by_numpy
-from test_robust_fit import EDGES, PREDICTION, SETTINGS
 
-from gripmon.track.edges import profile_kernel
-from gripmon.track.edges.profiles import estimate_noise, find_candidates, full_scale, quantum, read_profiles, weigh
-from gripmon.track.edges.settings import EdgeSettings
+from gripmon.track.edges.profiles import full_scale, read_profiles
 
-CLOSE = 1e-9
 HEIGHT, WIDTH = 576, 768
 
 
@@ -47,20 +40,6 @@ def maps(seed: int = 2, zoom: float = 1.0, inside: bool = True) -> tuple[np.ndar
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     map_x, map_y = at[:, :1] + c * along - across * s, at[:, 1:] + s * along + across * c
     return map_x.astype(np.float32), map_y.astype(np.float32)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("inside", [True, False])
-def test_the_compiled_sampler_is_that_of_numpy(kind: str, inside: bool):
-    image = picture(kind)
-    for zoom in (1.0, 4.0):
-        places = maps(zoom=zoom, inside=inside)
-        np.testing.assert_allclose(
-            read_profiles(image, *places),
-            by_numpy.read_profiles(image, *places),
-            rtol=0.0,
-            atol=CLOSE * full_scale(image),
-        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -105,64 +84,5 @@ def test_images_may_be_read_only_or_parts_of_others():
 def test_places_that_are_no_numbers_are_read_at_the_border():
     image = picture("uint8")
     place = np.array([np.nan, -np.inf, np.inf, 1e9, -1e9], dtype=np.float32)[None, None]
-    for read in (read_profiles, by_numpy.read_profiles):
-        profile = read(image, place, np.full_like(place, 7.0))[0]
-        np.testing.assert_allclose(profile, image[7, [0, 0, -1, -1, 0]], atol=1e-9)
-
-
-def some_profiles() -> list[tuple[np.ndarray, float, float]]:
-    """Profiles (n, 29) with the noise and full scale of their images; some with texture, some cut off, some not
-    numbers.
-    """
-    out = []
-    for kind in ("uint8", "uint16", "float32"):
-        image = picture(kind)
-        profiles = by_numpy.read_profiles(image, *maps())
-        out.append((profiles, estimate_noise(profiles, quantum(image)), full_scale(image)))
-    broken = out[0][0].copy()
-    broken[::9, 11] = np.nan
-    return [*out, (broken, *out[0][1:])]
-
-
-@pytest.mark.parametrize("zoom", [1, 2])
-def test_the_compiled_candidates_are_those_of_numpy(zoom: int):
-    ok = np.arange(200) % 11 != 3
-    for profiles, noise, most in some_profiles():
-        for settings in (EdgeSettings(), EdgeSettings(blur_px=1.2, noise_factor=8.0, contrast_fraction=0.1)):
-            one, other = (
-                find(profiles, ok, noise, most, settings, zoom) for find in (find_candidates, by_numpy.find_candidates)
-            )
-            assert len(one.sample) > 20
-            assert_alike(one, other)
-
-
-def test_the_compiled_noise_is_that_of_numpy():
-    for profiles, _, _ in some_profiles():
-        assert profile_kernel.low_third_difference(profiles) == by_numpy.low_third_difference(profiles)
-    for nothing in (np.zeros((0, 29)), np.zeros((5, 6))):
-        assert profile_kernel.low_third_difference(nothing) == by_numpy.low_third_difference(nothing) == 0.0
-    unknown = np.full((30, 29), np.nan)
-    assert np.isnan(profile_kernel.low_third_difference(unknown)) and np.isnan(by_numpy.low_third_difference(unknown))
-
-
-def test_the_compiled_weights_are_those_of_numpy():
-    polarity = (np.arange(EDGES) % 3 - 1).astype(np.int8)
-    for profiles, noise, most in some_profiles():
-        found = by_numpy.find_candidates(profiles, np.ones(200, dtype=bool), noise, most, EdgeSettings())
-        nothing = replace(found, **{f.name: getattr(found, f.name)[:0] for f in fields(found)[:6]})
-        for candidates in (found, replace(found, width_px=5.0 * found.width_px), nothing):
-            one, other = (w(candidates, PREDICTION, polarity, SETTINGS) for w in (weigh, by_numpy.weigh))
-            assert len(one.cut_off_px) == EDGES
-            assert_alike(one, other)
-
-
-def assert_alike(one: object, other: object) -> None:
-    for field in fields(one):  # type: ignore[arg-type]
-        left, right = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(left, np.ndarray) and left.dtype.kind == "f":
-            size = float(np.abs(right).max(initial=1e-300))
-            np.testing.assert_allclose(left, right, rtol=0.0, atol=CLOSE * size, err_msg=field.name)
-        elif isinstance(left, np.ndarray):
-            np.testing.assert_array_equal(left, right, err_msg=field.name)
-        else:
-            assert left == right or left is right, field.name
+    profile = read_profiles(image, place, np.full_like(place, 7.0))[0]
+    np.testing.assert_allclose(profile, image[7, [0, 0, -1, -1, 0]], atol=1e-9)

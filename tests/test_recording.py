@@ -272,16 +272,6 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     assert set(told.by_seq(f"{OVERLAY}/edges/used", "positions")) == shown
 
 
-def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
-    writer = recorder(tmp_path, patience_s=20.0, queue_frames=16, queue_images=2, image_rate_hz=1000.0)
-    for i in range(150):
-        writer.offer(frame(i), record(i), partial(trace, i))
-    writer.close(60.0)
-    assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
-    (path,) = tmp_path.glob("*.rrd")
-    assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(150))
-
-
 def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> None:
     moved = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2)
     writer = recorder(tmp_path)

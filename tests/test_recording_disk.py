@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import signal
@@ -12,7 +11,6 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import psutil
 import pytest
 from support.daemon_bench import Bench
 from support.loopback import alert_record
@@ -74,38 +72,6 @@ def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
     wait_until(lambda: writer.frames_written == written + count, LONG_S)
 
 
-def test_a_full_disk(small_disk: Path) -> None:
-    writer = recorder(small_disk)
-    offer_and_wait(writer, 0, 20)
-    first = writer.path
-    assert first is not None
-    ballast = small_disk / "someone-elses"
-    _fill(ballast)
-    lost = 0
-    while writer.failure is None:  # until its pages are full, too
-        assert lost < 2000
-        offer(writer, 20 + lost, 10)
-        lost += 10
-        time.sleep(0.05)
-    assert "recording failed: can't write" in writer.failure
-    wait_until(lambda: writer.frames_written + writer.dropped == 20 + lost, LONG_S)
-    ballast.unlink()
-    wait_until(lambda: writer.failure is None, LONG_S)
-    offer_and_wait(writer, 5000, 10)
-    second = writer.path
-    writer.close(60.0)
-    assert second is not None and second != first
-    assert Recorded(second).seqs() == list(range(5000, 5010))
-    # The first file ends with a whole message, or readers would refuse all of it.
-    from rerun.chunk import RrdReader
-
-    with pytest.warns(match="no footer"):
-        chunks = RrdReader(first).stream().to_chunks()
-    batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/record"]
-    held = [seq for batch in batches for seq in batch.column("frame").to_pylist()]
-    assert sorted(held) == list(range(writer.frames_written - 10))
-
-
 def test_a_disk_that_is_read_only(small_disk: Path) -> None:
     command("mount", "-o", "remount,ro", str(small_disk))
     writer = recorder(small_disk)
@@ -151,22 +117,6 @@ def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
     seqs = Recorded(first).seqs()
     assert seqs[:20] == list(range(20)) and seqs[-10:] == list(range(count, count + 10))
     assert len(seqs) == writer.frames_written
-
-
-def test_closing_while_the_disk_doesn_t_answer_takes_no_longer_than_allowed(freezable_disk: Path) -> None:
-    writer = recorder(freezable_disk)
-    offer_and_wait(writer, 0, 20)
-    worker = writer.process_id
-    assert worker is not None
-    command("fsfreeze", "--freeze", str(freezable_disk))
-    offer(writer, 20, 20)
-    begun_s = time.monotonic()
-    writer.close(1.0)
-    # Without a bound it would take as long as the disk stays frozen: for ever.
-    assert time.monotonic() - begun_s < LONG_S
-    assert writer.failure is not None and writer.dropped == 20
-    command("fsfreeze", "--unfreeze", str(freezable_disk))
-    wait_until(lambda: not psutil.pid_exists(worker) or _is_gone(worker), LONG_S)
 
 
 def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: Path) -> None:
@@ -244,20 +194,6 @@ def test_another_reason_is_told_and_other_figures_are_not() -> None:
     assert standing.text == updated.text
 
 
-@pytest.mark.slow("3 s; a directory that vanishes is in test_recording_faults")
-def test_a_directory_that_was_removed_is_made_again(tmp_path: Path) -> None:
-    folder = tmp_path / "deep" / "recordings"
-    writer = recorder(folder)
-    offer_and_wait(writer, 0, 5)
-    shutil.rmtree(folder.parent)
-    wait_until(lambda: offer(writer, 100, 1) or writer.failure is not None, LONG_S)
-    wait_until(lambda: writer.failure is None, LONG_S)
-    offer_and_wait(writer, 200, 5)
-    path = writer.path
-    writer.close(60.0)
-    assert path is not None and path.parent == folder and Recorded(path).seqs()[-5:] == list(range(200, 205))
-
-
 def test_the_daemon_says_so_and_goes_on() -> None:
     def failing(why: str | None):
         return lambda _: setattr(bench.recording, "failure", why)
@@ -270,23 +206,3 @@ def test_the_daemon_says_so_and_goes_on() -> None:
     assert [a.event for a in bench.recording.alerts] == [AlertEvent.RAISED, AlertEvent.CLEARED]
     assert [r.seq for r in bench.network.transforms] == [0, 1, 2, 3, 4]
     assert [len(s.open_alerts) for s in bench.network.states if "no space" in s.message][:1] == [1]
-
-
-def _fill(path: Path) -> None:
-    """With bytes until no more go there."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT)
-    try:
-        for size in (65_536, 4096):
-            with contextlib.suppress(OSError):
-                while os.write(descriptor, bytes(size)) == size:
-                    pass
-    finally:
-        os.close(descriptor)
-    assert shutil.disk_usage(path.parent).free < 4096
-
-
-def _is_gone(process_id: int) -> bool:
-    try:
-        return psutil.Process(process_id).status() == psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return True

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -39,8 +37,6 @@ from gripmon.record.columns import Row
 from gripmon.record.files import FileSeries
 from gripmon.record.recorder import make_scene
 from gripmon.record.write import ProcessRecorder
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture(autouse=True)
@@ -75,24 +71,6 @@ def running_worker(writer: ProcessRecorder) -> int:
     wait_until(lambda: writer.path is not None)
     assert writer.process_id is not None
     return writer.process_id
-
-
-def test_a_killed_daemon_leaves_a_complete_file(tmp_path: Path) -> None:
-    script = (
-        "import os, signal, sys, time; from pathlib import Path; from support.recorded import *;"
-        "w = recorder(Path(sys.argv[1]), flush_period_s=0.5); wait_until(lambda: w.path is not None);"
-        "[w.offer(frame(i), record(i), lambda i=i: trace(i)) for i in range(50)];"
-        "print(w.process_id, flush=True); time.sleep(1.0); w.offer(frame(50), record(50), lambda: None);"
-        "os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    paths = f"import sys; sys.path[:0] = [{str(HERE)!r}, {str(HERE.parent)!r}]; "
-    daemon = subprocess.run([sys.executable, "-c", paths + script, tmp_path], stdout=subprocess.PIPE, check=False)
-    assert daemon.returncode == -signal.SIGKILL
-    worker = int(daemon.stdout)
-    wait_until(lambda: not psutil.pid_exists(worker) or psutil.Process(worker).status() == psutil.STATUS_ZOMBIE)
-    (path,) = tmp_path.glob("*.rrd")
-    # Only what was handed over within the last instant may be missing.
-    assert Recorded(path).seqs()[:50] == list(range(50))
 
 
 def test_a_killed_recording_process_is_replaced(tmp_path: Path) -> None:
@@ -248,31 +226,6 @@ def test_a_directory_that_vanishes_is_reported(tmp_path: Path) -> None:
     writer.close(60.0)
     (path,) = directory.glob("*.rrd")
     assert Recorded(path).seqs() == [6, 7, 8]
-
-
-@pytest.mark.slow("3 s; that files roll over is in test_recording_kept")
-def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -> None:
-    writer = recorder(tmp_path, max_file_bytes=150_000, flush_period_s=0.05, image_rate_hz=1000.0)
-    running_worker(writer)
-    for i in range(0, 32, 4):
-        for k in range(i, i + 4):
-            noise = np.random.default_rng(k).integers(0, 256, PICTURE.shape, np.uint8)
-            writer.offer(frame(k, noise), record(k), partial(trace, k))
-        wait_until(lambda count=i + 4: writer.frames_written == count)
-    writer.close(60.0)
-    paths = sorted(tmp_path.glob("*.rrd"))
-    assert len(paths) > 3
-    assert [path.name for path in paths] == [f"run-{k:04d}.rrd" for k in range(1, len(paths) + 1)]
-    seen: list[int] = []
-    for path in paths:
-        told = Recorded(path)
-        assert told.blueprint and told.cells["about"] and told.cells["rig/camera"]
-        assert path.stat().st_size < 700_000
-        if seqs := told.seqs():
-            assert told.timed("rig/reference") and told.by_seq("status/state", "state")[seqs[0]] == ["tracking"]
-        seen += told.seqs()
-    assert seen == list(range(32))
-    assert len(Recorded(*paths).recording_ids) == 1
 
 
 def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import time
 from functools import partial
 from pathlib import Path
 
-import psutil
 import pytest
 import yaml
 from support.gripmon_process import gripmon
@@ -22,14 +20,6 @@ from gripmon.record.write import ProcessRecorder
 
 DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
 PICTURE = image(0)
-
-
-@pytest.fixture
-def slow_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording process that needs two seconds before it does anything, as on a busy machine."""
-    from gripmon.record import process
-
-    monkeypatch.setattr(process, "_BOOTSTRAP", f"import time; time.sleep(2.0); {process._BOOTSTRAP}")
 
 
 def stopped(writer: ProcessRecorder) -> int:
@@ -99,52 +89,6 @@ def test_whoever_can_wait_gets_all_images_around_an_alert(tmp_path: Path) -> Non
         writer.offer(frame(i, PICTURE), record(i, alerts=(DRIFT,) * (i == 40)), partial(trace, i))
     writer.close(30.0)
     assert (writer.dropped, writer.images_dropped, pictures(tmp_path)) == (0, 0, set(range(60)))
-
-
-def test_a_configuration_error_is_told_alone_and_at_once(tmp_path: Path) -> None:
-    demo = builtin_config("demo.yaml")
-    settings = yaml.safe_load(demo.read_text())
-    settings |= {
-        "gripper": str(demo.parent / settings["gripper"]),
-        "source": {"kind": "folder", "path": "nowhere"},
-        "publish": {"enabled": False},
-    }
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
-    done = gripmon("run", tmp_path / "config.yaml", "--out", tmp_path / "out", timeout_s=400.0)
-    assert done.returncode == 2
-    (line,) = (line for line in done.stderr.splitlines() if "WARNING" not in line)
-    assert line.startswith(f"{tmp_path / 'config.yaml'}: source.path")
-
-
-@pytest.mark.usefixtures("slow_start")
-def test_a_recorder_that_was_given_nothing_ends_at_once_and_says_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    writer = recorder(tmp_path)
-    process = writer.process_id
-    begun_s = time.monotonic()
-    writer.close(2.0)
-    assert time.monotonic() - begun_s < 1.0 and (writer.failure, caplog.text) == (None, "")
-    assert process is not None and not psutil.pid_exists(process)
-
-
-@pytest.mark.usefixtures("slow_start")
-def test_a_process_that_has_everything_and_is_only_slow_is_left_to_finish(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Ctrl-C while it still starts: the file is complete all the same, some time after the monitor's end."""
-    writer = recorder(tmp_path)
-    process = writer.process_id
-    assert process is not None
-    for i in range(20):
-        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
-    with caplog.at_level(logging.WARNING, "gripmon.record"):
-        writer.close(0.5)
-    assert (writer.failure, writer.dropped) == (None, 0) and "incomplete" not in caplog.text
-    wait_until(lambda: psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
-    (path,) = tmp_path.glob("*.rrd")
-    assert Recorded(path).seqs() == list(range(20))
-    os.waitpid(process, 0)
 
 
 def test_a_process_that_ends_while_it_is_written_to_still_says_why(

@@ -53,8 +53,7 @@ def watched(monitor: Monitor, frames: Sequence[Frame]) -> list[FrameRecord]:
     return [monitor.process(frame) for frame in frames]
 
 
-@pytest.mark.parametrize("buffers", [1, 3])
-@pytest.mark.parametrize("knocked", [False, True])
+@pytest.mark.parametrize(("knocked", "buffers"), [(False, 3), (True, 1)])
 def test_rows_that_are_left_from_before_are_never_valid(knocked: bool, buffers: int):
     """Whether the mount was knocked meanwhile can't be known then; afterwards it is."""
     mount = (Bump(at_s=2.0, tcp_shift_m=(0.003, 0.003)),) if knocked else ()
@@ -120,8 +119,7 @@ def test_a_still_robot_as_h264_stays_valid_for_as_long_as_a_coder_may_leave_it_o
     assert all(record.reason == TEXT or "frozen" in record.reason for record in doubted[:1])
 
 
-@pytest.mark.parametrize("quality", [None, 90, 40])
-@pytest.mark.parametrize("sensor", [Sensor(), QUIET])
+@pytest.mark.parametrize(("sensor", "quality"), [(Sensor(), 40), (QUIET, None)])
 def test_jpegs_of_a_still_robot_are_new_each_time(sensor: Sensor, quality: int | None):
     """Down to a noise of 0.2 grey levels and strong compression."""
     frames, _ = rendered(scene(2.0, sensor))

@@ -236,19 +236,3 @@ def test_wrong_usage_is_one_line(collision: tuple[Path, Simulator], tmp_path: Pa
     ):
         code, _, err = run(capsys, *arguments)
         assert code == 2 and word in err and len(err.splitlines()) == 1
-
-
-def test_a_page_that_cannot_be_written_leaves_the_old_one(
-    reported: tuple[Path, Report], collision: tuple[Path, Simulator], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    import os
-
-    page = tmp_path / "page.html"
-    page.write_text("old")
-
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert main(["report", str(collision[0]), "--out", str(page)]) == 2
-    assert page.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["page.html"]

@@ -6,7 +6,6 @@ In one process on the core, and as users meet it: ``gripmon run`` killed and sta
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -23,7 +22,7 @@ from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.simulated import nominal_cam_T_grip
 from support.watched import frames_of, new_monitor, pose_of, reference_of, restarted
 
-from gripmon.daemon.config import load_config
+from gripmon.cli import main
 from gripmon.judge.references import ReferenceBook
 from gripmon.model.records import (
     AlertEvent,
@@ -243,37 +242,6 @@ def cell(tmp_path: Path, pictures: Path) -> Iterator[Cell]:
         yield Cell(tmp_path, pictures, session, endpoint)
 
 
-@pytest.mark.slow("10 s; killed at any moment is in test_killed, what is kept in the default run")
-def test_undone_killed_and_started_again_it_goes_on(cell: Cell):
-    kept = keep(cell.config, 2e-5, -1e-5)
-    second, third = kept.references[1:]
-    with cell.monitor():
-        assert cell.wait_valid().reference_id == third.reference_id
-        undone = cell.send("undo")
-        assert (undone.returncode, undone.stderr) == (0, "")
-        fourth = cell.wait(lambda record: record.revision == 3, "the undo to be named").reference_id
-        assert fourth in undone.stdout and second.reference_id in undone.stdout
-        refused = cell.send("accept", "nothing")
-        assert (refused.returncode, refused.stdout) == (3, "")
-        assert refused.stderr == "refused: no new reference is proposed\n"
-    with cell.monitor():
-        cell.wait_valid()
-        assert {(record.reference_id, record.revision) for record in cell.transforms} == {(fourth, 3)}
-        assert cell.transforms[0].verdict is not Verdict.VALID
-        wait_until(lambda: cell.alerts, "the alert of the restart")
-        assert cell.alerts[0]["kind"] == "restarted" and f"{fourth}, revision 3" in str(cell.alerts[0]["text"])
-        reference = cell.reference()
-        assert (reference.parent, reference.restores) == (third.reference_id, second.reference_id)
-        told = cell.send("state")
-        assert told.returncode == 0
-        assert [line.split()[:2] for line in told.stdout.splitlines() if line.startswith("  ")] == [
-            [str(i), name]
-            for i, name in enumerate(["demo-calibration", second.reference_id, third.reference_id, fourth])
-        ]
-        whole = cell.send("state", "--json")
-        assert [r["revision"] for r in json.loads(whole.stdout)["monitor"]["references"]] == [0, 1, 2, 3]
-
-
 def test_a_damaged_file_is_set_aside_said_on_the_network_and_replaced(cell: Cell):
     keep(cell.config, 2e-5)
     cell.kept.write_bytes(cell.kept.read_bytes()[:-100])
@@ -307,29 +275,6 @@ def test_a_changed_calibration_and_a_fresh_start_begin_anew_with_the_next_revisi
     ]
 
 
-@pytest.mark.slow("13 s: refusals of the state file are tested without a daemon")
-def test_another_robots_state_and_a_file_in_use_are_refused_in_one_line(cell: Cell):
-    keep(cell.config, 2e-5)
-    before = cell.kept.read_bytes()
-    text = cell.config.read_text()
-    with cell.monitor() as first:
-        cell.wait_valid()
-        second = cell.run()
-        assert second.returncode == 2
-        assert second.stderr == (
-            f"{cell.config}: state.file: {cell.kept} is in use by process {first.pid}; stop that one, or give this "
-            "monitor a file of its own\n"
-        )
-    cell.config.write_text(text.replace("robot: demo", "robot: other"))
-    other = cell.run()
-    assert (other.returncode, other.stdout) == (2, "")
-    assert other.stderr == (
-        f"{cell.config}: state.file: {cell.kept} is the state of demo/wrist, not of other/wrist; a file of its own for "
-        "each monitor\n"
-    )
-    assert load_config(cell.config).settings.robot == "other" and cell.kept.stat().st_size >= len(before)
-
-
 def test_a_folder_that_can_not_be_written_is_said_and_the_monitor_goes_on(cell: Cell):
     (cell.folder / "a-file").write_text("x")
     cell.config.write_text(cell.config.read_text().replace("kept.json", "a-file/kept.json"))
@@ -359,28 +304,15 @@ def test_a_command_to_nobody_is_one_line_and_exit_code_3(cell: Cell):
         (["undo", "--zenoh-config", "x.json5"], "send: --connect has no effect beside --zenoh-config; one of them\n"),
     ],
 )
-def test_wrong_usage_of_send_is_one_line_and_exit_code_2(cell: Cell, arguments: list[str], said: str):
-    done = cell.send(*arguments)
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+def test_wrong_usage_of_send_is_one_line_and_exit_code_2(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["send", *arguments, "--robot", "demo", "--connect", free_endpoint()]) == 2
+    assert capsys.readouterr() == ("", said)
 
 
 @pytest.mark.parametrize("robot", ["two words", "a/b", ""])
-def test_a_name_that_can_not_be_is_wrong_usage(cell: Cell, robot: str):
-    done = cell.send("undo", robot=robot)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "can't be part of a Zenoh key" in done.stderr
-
-
-@pytest.mark.slow("5 s: two commands that have no business there; what a restart keeps is in the default run")
-def test_replay_and_check_leave_the_state_alone(cell: Cell, pictures: Path, tmp_path: Path):
-    keep(cell.config, 2e-5)
-    before = {path.name: path.read_bytes() for path in cell.folder.glob("kept*")}
-    images = tmp_path / "few"
-    images.mkdir()
-    for path in sorted(pictures.iterdir())[:3]:
-        (images / path.name).symlink_to(path.resolve())
-    out = tmp_path / "out.jsonl"
-    assert gripmon("replay", str(images), "--config", str(cell.config), "--out", str(out)).returncode == 0
-    assert gripmon("check", str(cell.config)).returncode == 0
-    assert {json.loads(line)["revision"] for line in out.read_text().splitlines()} == {0}
-    assert {path.name: path.read_bytes() for path in cell.folder.glob("kept*")} == before
-    assert not (Path(os.environ["XDG_STATE_HOME"])).exists()
+def test_a_name_that_can_not_be_is_wrong_usage(robot: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["send", "undo", "--robot", robot, "--connect", free_endpoint()]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "can't be part of a Zenoh key" in said

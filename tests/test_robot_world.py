@@ -40,7 +40,7 @@ def noisy(cam_T_target, sigma, seed):
     return np.stack([perturb(T, sigma * rng.normal(size=6)) for T in cam_T_target])
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_closed_form_is_exact_without_noise_whatever_the_quaternions_signs(seed):
     cam_T_base, ee_T_target, base_T_ee, cam_T_target = poses(seed, 3 + seed)
     found = robot_world.solve(cam_T_target, base_T_ee)

@@ -132,7 +132,7 @@ def with_background_edge(edge: int, beside_px: float, true_one_seen: bool) -> Ca
     return candidates(np.concatenate([kept, mine]), np.concatenate([offset_px[kept], trap_px]))
 
 
-@pytest.mark.parametrize("beside_px", [-2.5, -1.5, 1.5, 2.5])
+@pytest.mark.parametrize("beside_px", [-2.5, 1.5])
 def test_an_edge_of_the_background_beside_one_of_the_gripper_does_not_move_the_fit(beside_px: float):
     """The trap for lines that are fitted one by one: complete, parallel, and maybe closer to the prediction."""
     for edge in SAMPLED:

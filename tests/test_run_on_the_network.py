@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -75,8 +74,6 @@ def test_a_port_in_use_is_said_in_one_line(tmp_path: Path, endpoint: str):
     ("file", "text", "said"),
     [
         ("there.json5", None, "publish.zenoh_config: no file "),
-        ("there.json5", "{mode: 'peer', listen: 3}", "publish.zenoh_config: "),
-        ("there.json5", "no json", "publish.zenoh_config: "),
         ("there.yaml", "mode: sideways", "publish.zenoh_config: "),
     ],
 )
@@ -86,28 +83,6 @@ def test_a_bad_zenoh_configuration_is_said_in_one_line(tmp_path: Path, file: str
     config = configured(tmp_path, f"{{zenoh_config: {file}}}")
     line = refused(config)
     assert line.startswith(f"{config}: {said}") and file in line and ".rs:" not in line
-
-
-@pytest.mark.slow("6 s; late joiners are in test_publish")
-def test_a_router_that_comes_later_hears_what_was_missed(tmp_path: Path, endpoint: str):
-    config = configured(tmp_path, f"{{mode: client, connect: [{endpoint}], retry_longest_s: 0.5}}")
-    with running(config) as process:
-        said: list[str] = []
-        assert process.stderr is not None
-        while "no Zenoh session yet, trying again" not in (line := process.stderr.readline()):
-            assert line, "it goes on without a router"
-            said.append(line)
-        while "state tracking" not in process.stderr.readline():  # frames have come, and gone nowhere
-            assert process.poll() is None
-        with plain_session(listen=endpoint, mode="router") as router:
-            states: list[dict] = []  # type: ignore[type-arg]
-            wait_until(lambda: states.extend(ask(router, f"{PREFIX}/state")) or states, "the state", 60.0)
-            wait_until(lambda: ask(router, f"{PREFIX}/state")[0]["frames"] > states[0]["frames"], "frames go on", 60.0)
-            state = ask(router, f"{PREFIX}/state")[0]
-        assert state["transforms_unsent"] > 0 and state["schema"] == "gripmon.state/1"
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(WAIT_S) == 0
-    assert not [line for line in said if "Traceback" in line]
 
 
 def test_malformed_messages_are_counted_in_the_state(tmp_path: Path, endpoint: str):
@@ -145,16 +120,6 @@ def test_a_snapshot_of_the_real_monitor_can_be_replayed(tmp_path: Path, endpoint
     assert len(both) >= 4
     for corner in both:
         assert corner.uv_px == pytest.approx(measured[corner.id], abs=0.3), "px, from two starting points"
-
-
-def test_a_killed_monitor_is_missed(tmp_path: Path, endpoint: str):
-    """kill -9: the liveliness token is gone without anybody's doing."""
-    config = configured(tmp_path, f"{{listen: [{endpoint}]}}")
-    with running(config) as process, opened_when_it_listens(process, endpoint) as session:
-        tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
-        wait_until(lambda: (sample := tokens.try_recv()) is not None and sample.kind == zenoh.SampleKind.PUT, "alive")
-        process.kill()
-        wait_until(lambda: (sample := tokens.try_recv()) is not None and sample.kind == zenoh.SampleKind.DELETE, "gone")
 
 
 @contextmanager

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.by_numpy import drift
 from support.drift_noise import COVARIANCE, autocorrelated, claimed
 
+from gripmon.judge.drift import kernel
 from gripmon.judge.drift.statistics import LENGTHS, PRIOR_SHARE, PRIOR_WINDOWS, RARE, Scatter, Windows
 
 FRAMES, STREAMS = 12_000, 24
@@ -30,7 +30,20 @@ def covariances(scatter: Scatter, reported: np.ndarray, inflation: np.ndarray) -
     """(k, s, 6, 6) of means and of differences, ``reported`` (s, 6, 6) being what a frame claims for itself, and what
     the stream has shown counting by the variance's ``inflation`` (k, s) more.
     """
-    return drift.covariances(reported, scatter.of_differences, scatter.learnt, inflation, RARE)
+    lengths, streams = inflation.shape
+    matrices = (6, 6)
+    plain, whitening = (np.empty((2, some, streams, *matrices)) for some in (1, lengths))
+    of_mean, learnt_whitening = (np.empty((lengths, streams, *matrices)) for _ in range(2))
+    reference, to_reported, from_reported = (np.zeros((streams, *matrices)) for _ in range(3))
+    times, known = np.stack([inflation] * 3), np.zeros((2, lengths, streams), dtype=bool)
+    kernel.refresh(
+        reported, scatter.of_differences, scatter.learnt, times, RARE, reference, known, plain, of_mean, whitening,
+        learnt_whitening, to_reported, from_reported,
+    )  # fmt: skip
+    root = np.linalg.inv(whitening)
+    both = root @ np.swapaxes(root, -1, -2)
+    np.testing.assert_allclose(both[0], of_mean, rtol=1e-7, atol=1e-20)
+    return of_mean, both[1]
 
 
 def share(covariance: np.ndarray) -> float:
@@ -121,3 +134,36 @@ def test_what_is_not_usable_is_not_learnt():
     np.testing.assert_array_equal(scatter.of_differences[:, 1], before[:, 1])
     np.testing.assert_array_equal(scatter.windows[:, 1], windows[:, 1])
     assert (scatter.of_differences[:, 0] != before[:, 0]).all()
+
+
+def what_is_missing(shown: np.ndarray) -> np.ndarray:
+    """The part of the claimed covariance, direction by direction, that exceeds what was shown (..., 6, 6)."""
+    root = np.linalg.cholesky(COVARIANCE)
+    inverse = np.linalg.inv(root)
+    shares, directions = np.linalg.eigh(inverse @ shown @ inverse.T)
+    towards = root @ directions
+    return np.asarray((towards * np.maximum(1.0 - shares, 0.0)[..., None, :]) @ np.swapaxes(towards, -1, -2))
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3, 1.0, 3.0])
+def test_what_is_missing_of_the_claim_comes_on_top_direction_by_direction(seen: float):
+    """Less than claimed in some directions, more in others; against eigenvalues, at every length."""
+    rng = np.random.default_rng(5)
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    mix = np.eye(6) + 0.2 * rng.normal(size=(len(LENGTHS), 2, 6, 6))
+    scatter.of_differences[:] = seen * mix @ COVARIANCE @ mix.swapaxes(-1, -2) + 1e-3 * COVARIANCE
+    scatter.windows[:] = rng.uniform(12.0, 200.0, scatter.windows.shape)
+    inflation = rng.uniform(1.0, 3.0, (len(LENGTHS), 2))
+    parts = 0.25 * scatter.of_differences
+    parts[-1] *= 2.0  # beyond the longest, windows count as independent
+    total, shown = (
+        np.flip(np.cumsum(np.flip(times[..., None, None] * parts, axis=0), axis=0), axis=0)
+        for times in (inflation, scatter.learnt)
+    )
+    rarely = np.concatenate([shown, np.zeros_like(shown[:1])])[RARE]
+    differences = inflation[..., None, None] * scatter.of_differences + 2.0 * what_is_missing(shown[:1] - rarely)
+    for found, expected in zip(
+        covariances(scatter, claimed(2), inflation), (total + what_is_missing(shown[:1]), differences), strict=True
+    ):
+        assert (np.abs(found - expected) <= 1e-7 * np.abs(expected).max(axis=(-2, -1), keepdims=True)).all()

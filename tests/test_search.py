@@ -45,25 +45,17 @@ def is_true(found: Measurement, cam_T_grip: np.ndarray) -> bool:
     return bool(np.abs(error[:2]).max() < 1.5e-4 and abs(error[2]) < 6e-4)
 
 
-@pytest.mark.parametrize(
-    ("scene", "least"),
-    [
-        pytest.param("static", 29, marks=pytest.mark.slow("clutter is in the default run")),
-        pytest.param("bump", 29, marks=pytest.mark.slow("clutter is in the default run")),
-        ("clutter", 27),
-    ],
-)
-def test_random_jumps_are_found_and_never_a_wrong_place_is_trusted(scene: str, least: int):
-    """Of 30 jumps, in one frame; the third scene is full of straight edges."""
+def test_random_jumps_are_found_and_never_a_wrong_place_is_trusted():
+    """Of 30 jumps, in one frame, before a background that is full of straight edges."""
     rng, true = np.random.default_rng(11), nominal_cam_T_grip()
     found = 0
     for seed in (3, 4, 5):
-        image = picture(make_scenario(scene), 0, seed)
+        image = picture(make_scenario("clutter"), 0, seed)
         for xi in jumps(rng, 10):
             got = measure(image, moved(true, xi), patience=EVERYWHERE)
             assert not got.trusted or is_true(got, true), xi
             found += got.trusted
-    assert found >= least
+    assert found >= 27
 
 
 def test_without_patience_a_jump_is_not_found_and_not_trusted():
@@ -120,7 +112,7 @@ def test_a_proposed_pose_puts_the_gripper_where_it_is():
         assert min(outline_misses_px(pose, true) for pose in poses[:3]) < 7.0
 
 
-@pytest.mark.parametrize("shift_m", [(0.009, 0.0, 0.0), (0.0, -0.009, 0.0), (0.0, 0.0, 0.009), (0.006, 0.006, -0.008)])
+@pytest.mark.parametrize("shift_m", [(0.0, -0.009, 0.0), (0.006, 0.006, -0.008)])
 def test_the_votes_know_that_what_is_nearer_is_shifted_by_more(shift_m: tuple[float, float, float]):
     """Fingers 40 mm long at 115 mm: a shift and a scale of the image leave up to 3.3 cells."""
     image, expected = picture(plain_scenario()), nominal_cam_T_grip()

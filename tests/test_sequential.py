@@ -205,7 +205,7 @@ def rested() -> SequentialTest:
     return test
 
 
-@pytest.mark.parametrize("sizes", [13.0, 15.0, 20.0, 60.0, 200.0])
+@pytest.mark.parametrize("sizes", [13.0, 60.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_delay_of_a_step_is_that_of_the_formulas(rested: SequentialTest, sizes: float, sign: float):
     rng, test = np.random.default_rng(5), copy.deepcopy(rested)
@@ -246,7 +246,7 @@ def test_a_step_is_told_from_an_offset_and_its_length_dates_it():
 # --- what does not decide ---
 
 
-@pytest.mark.parametrize("sizes", [10.0, 100.0, 1e4])
+@pytest.mark.parametrize("sizes", [10.0, 1e4])
 def test_one_wild_frame_never_decides(sizes: float):
     """Not the first one either, and not one every now and then."""
     rng = np.random.default_rng(8)
@@ -346,3 +346,23 @@ def test_streams_know_nothing_of_one_another():
             assert one.length[0] == all_of_them.length[stream]
             assert one.stepped[0] == all_of_them.stepped[stream]
             np.testing.assert_allclose(one.excess[0], all_of_them.excess[stream], rtol=1e-6)
+
+
+def test_it_is_one_whether_a_frame_teaches_at_once_or_with_the_next():
+    """What is learnt after the transform has left is what the next frame would have learnt first."""
+    at_once, later = (SequentialTest(DriftSettings()) for _ in range(2))
+    for shift in autocorrelated(np.random.default_rng(6), 400, 1):
+        one, other = at_once.add(shift, claimed(1)), later.add(shift, claimed(1))
+        at_once.learn()
+        at_once.learn()  # a second time teaches nothing
+        assert one.moved == other.moved and one.excess == other.excess
+    assert at_once.refreshes - later.refreshes in (0, 1) and later.refreshes > 20
+    later.learn()
+    np.testing.assert_array_equal(at_once.scatter.of_differences, later.scatter.of_differences)
+
+
+def test_what_has_no_root_is_an_error():
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        SequentialTest(DriftSettings()).square_beyond(np.ones(6), -np.eye(6))
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        SequentialTest(DriftSettings()).add(np.zeros((1, 6)), -np.eye(6)[None])

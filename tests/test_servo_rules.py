@@ -47,13 +47,6 @@ def test_what_a_verdict_allows(verdict, age_s, sigma_m, moving, action, grasp):
     assert may_grasp(verdict, allowed) is grasp
 
 
-def test_speeds_are_in_the_order_of_trust():
-    from servoing.rules import Action, Limits
-
-    speeds = [Limits().speed(action) for action in (Action.STOP, Action.SLOW, Action.GO)]
-    assert speeds[0] == 0.0 and speeds[2] == 1.0 and 0.0 < speeds[1] < 1.0
-
-
 def _run(verdicts: str, places: list[float], closed: int | None = None):
     """A run of one arm by letters of verdicts (v, s, u) and a joint's angles."""
     from servoing.rules import Action
@@ -91,31 +84,6 @@ def test_breaches_are_counted_from_joints_and_verdicts_alone(verdicts, places, c
     from servoing.figures import Conduct, conduct
 
     assert conduct(*_run(verdicts, places, closed)) == Conduct(*expected)
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--runs", "0"], "'0'; a whole number, 1 to 1000"),
-        (["--seed", "-1"], "'-1' is not a seed"),
-        (["--fps", "5"], "'5'; a number from 10 to 200"),
-        (["--fps", "nan"], "'nan'; a number from 10 to 200"),
-        (["--json", "/nowhere/at/all.json"], "--json /nowhere/at/all.json: can't be written"),
-    ],
-)
-def test_wrong_usage_is_one_line(options: list[str], said: str, monkeypatch, capsys: pytest.CaptureFixture[str]):
-    import importlib.util
-
-    from servoing import __main__ as command
-
-    monkeypatch.setattr(sys, "argv", ["servo", *options])
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
-    try:
-        code = command.main()
-    except SystemExit as ended:
-        code = ended.code
-    assert code == 2
-    assert said in capsys.readouterr().err.splitlines()[-1]
 
 
 def _whole_run(row, number: int, *, off_mm: float, verdicts: str, places: list[float]):
@@ -164,18 +132,3 @@ def test_the_exit_code_says_whether_all_was_reached(
     assert said in capsys.readouterr().out
     rows = json.loads((tmp_path / "servo.json").read_text())["rows"]
     assert len(rows) == 16 and rows[0]["final_m"] == [4.5e-3]
-
-
-def test_a_failed_monitor_is_exit_code_3(monkeypatch, capsys: pytest.CaptureFixture[str]):
-    pytest.importorskip("pinocchio")
-    from servoing import __main__ as command
-    from servoing import runs
-    from servoing.feed import FeedError
-
-    def run(*_args, **_named):
-        raise FeedError("the monitor has sent nothing for 90 s")
-
-    monkeypatch.setattr(runs, "run", run)
-    monkeypatch.setattr(sys, "argv", ["servo", "--runs", "1"])
-    assert command.main() == 3
-    assert capsys.readouterr().err.splitlines()[-1] == "servo: the monitor has sent nothing for 90 s"

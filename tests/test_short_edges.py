@@ -105,14 +105,14 @@ def test_an_edge_that_the_border_cuts_is_sampled_up_to_it(turn_rad: float):
     assert cut >= 3
 
 
-@pytest.mark.parametrize(("length_px", "count"), [(4.0, 5), (8.0, 9), (8.0, 4), (16.0, 6)])
+@pytest.mark.parametrize(("length_px", "count"), [(4.0, 5), (8.0, 9), (16.0, 6)])
 def test_the_mean_of_profiles_that_share_pixels_scatters_as_if_they_were_fewer(length_px: float, count: int):
     """Noise of 4 grey levels on a step of 40; without noise they would all be the same."""
     rng = np.random.default_rng(3)
     offsets_px, noise_dn = profile_offsets_px(7.0), 4.0
     v, u = np.mgrid[0:48, 0:48].astype(float)
     means, singles = [], []
-    for _ in range(1500):
+    for _ in range(700):
         angle = rng.uniform(0.0, 2.0 * np.pi)
         normal, middle = np.array([np.cos(angle), np.sin(angle)]), 23.5 + rng.uniform(-0.5, 0.5, 2)
         away_px = (u - middle[0]) * normal[0] + (v - middle[1]) * normal[1]
@@ -128,7 +128,7 @@ def test_the_mean_of_profiles_that_share_pixels_scatters_as_if_they_were_fewer(l
         if (np.bincount(found.sample[near], minlength=count) == 1).all():
             means.append(found.offset_px[near].mean())
             singles.append(found.offset_px[near])
-    assert len(means) > 1000
+    assert len(means) > 450
     part = independent_part(uv_px, np.zeros(count, dtype=np.intp), 1, float(ROWS))[0]
     assert np.var(means) / np.var(singles) == pytest.approx(1.0 / (part * count), rel=0.2)
 
@@ -138,11 +138,11 @@ def test_the_mean_of_profiles_that_share_pixels_scatters_as_if_they_were_fewer(l
 
 @pytest.mark.parametrize("tip", TIPS)
 def test_tips_of_short_edges_are_measured_as_exactly_as_is_said(tip: str):
-    """Before another background for each of ten short sequences."""
+    """Before another background for each of six short sequences."""
     model, solids = fingers(tip)
     camera, pose, nees, valid, frames = make_camera(PAPER_LENS), nominal_cam_T_grip(), [], 0, 0
     scenario = make_scenario("clutter", duration_s=0.4, fps=15.0)
-    for seed in range(10):
+    for seed in range(6):
         simulator = Simulator(camera, solids, pose, scenario, seed)
         indices = range(simulator.frame_count)
         monitor = Monitor(camera, model, MonitorSettings(), reference_of(pose))
@@ -158,7 +158,7 @@ def test_tips_of_short_edges_are_measured_as_exactly_as_is_said(tip: str):
             assert record.protection is not None
             assert np.linalg.norm(away[:3]) <= record.protection.position_m
             valid += record.verdict is Verdict.VALID
-    assert frames == 50 and valid / frames > VALID[tip]
+    assert frames == 30 and valid / frames > VALID[tip]
     assert np.mean(nees) < 3.0 * 6.0 and np.median(nees) < 2.0 * 5.35, "chi-square of six: mean and median"
 
 
@@ -189,7 +189,7 @@ def slid(slide_m: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tip", TIPS)
-@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.012, 0.02), (-0.018, 0.04)])
+@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.018, 0.04)])
 def test_a_rim_parallel_to_short_edges_is_no_end_of_the_fingers(tip: str, z_m: float, size_z_m: float):
     """A bar before the tips, and the fit starts from everywhere along the fingers."""
     model, solids = fingers(tip)
@@ -199,7 +199,7 @@ def test_a_rim_parallel_to_short_edges_is_no_end_of_the_fingers(tip: str, z_m: f
 
 
 @pytest.mark.parametrize("tip", TIPS)
-@pytest.mark.parametrize(("from_tip_m", "to_m"), [(0.0008, 0.02), (0.0012, 0.0015), (0.0018, 0.02), (0.003, 0.0033)])
+@pytest.mark.parametrize(("from_tip_m", "to_m"), [(0.0008, 0.02), (0.003, 0.0033)])
 @pytest.mark.parametrize("gain", [0.4, 2.2])
 def test_a_shadow_parallel_to_short_edges_is_no_end_of_the_fingers(
     tip: str, from_tip_m: float, to_m: float, gain: float

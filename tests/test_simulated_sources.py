@@ -269,20 +269,6 @@ def test_renderers_end_when_their_parent_is_killed(started: tuple[subprocess.Pop
 # --- the simulator behind it ---
 
 
-@pytest.mark.slow("16 s; a simulated sequence, frame by frame, is in the default run")
-def test_the_live_camera_shows_what_the_simulator_renders(cameras: list[SimulatedCamera], scene: SimulatedScene):
-    settings = SimulatedSettings(scenario="jaw_cycle", fps=25.0, seed=3)
-    camera = open_source(settings, scene=scene)
-    assert isinstance(camera, SimulatedCamera)
-    cameras.append(camera)
-    simulator = make_simulator(settings, scene, Path())
-    for frame in frames_of(camera, 4):
-        expected = simulator.frame(frame.seq)
-        np.testing.assert_array_equal(frame.image, expected.image)
-        assert frame.jaw_opening_m == expected.jaw_opening_m
-        assert frame.name == "jaw_cycle"
-
-
 def test_the_sequence_is_the_scenario_frame_by_frame(scene: SimulatedScene):
     settings = SimulatedSettings(scenario="bump", duration_s=0.5, fps=10.0, seed=3, realtime=False)
     source = open_source(settings, scene=scene)

@@ -171,24 +171,6 @@ def test_automatic_exposure_forgets_a_light_step_with_its_time_constant() -> Non
     assert exposure(Light(flicker=0.1, flicker_hz=100.0), 0.0025) == pytest.approx(1.1)
 
 
-@pytest.mark.parametrize(
-    ("name", "axis", "mean_m", "sigma_m"), [("series1", 0, 1.5e-3, 3e-4), ("series2", 1, 4.5e-3, 2e-4)]
-)
-def test_series_are_twenty_pairs_as_in_the_paper(name: str, axis: int, mean_m: float, sigma_m: float) -> None:
-    sim = simulator(make_scenario(name))
-    truths = [sim.truth(i) for i in range(sim.frame_count)]
-    assert len(truths) == 40
-    for before, after in zip(truths[::2], truths[1::2], strict=True):
-        np.testing.assert_array_equal(before.cam_T_grip, before.reference_cam_T_grip)
-        np.testing.assert_array_equal(before.reference_cam_T_grip, after.reference_cam_T_grip)
-        assert after.visible.sum() == 6 and before.visible.sum() == 6
-    shifts = np.array([t.tcp_shift_m for t in truths[1::2]])
-    assert shifts[:, axis].mean() == pytest.approx(mean_m, abs=3.0 * sigma_m / np.sqrt(20))
-    assert 0.5 * sigma_m < shifts[:, axis].std() < 1.6 * sigma_m
-    references = np.array([t.reference_cam_T_grip[:3, 3] for t in truths[::2]])
-    assert (references.std(axis=0) > 1e-3).all()
-
-
 @pytest.mark.parametrize("duration_s", [2.0, 20.0, 300.0])
 def test_the_demo_shows_everything_at_any_length(duration_s: float) -> None:
     sim = simulator(make_scenario("demo", duration_s=duration_s, fps=60.0))

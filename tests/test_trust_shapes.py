@@ -278,7 +278,13 @@ def test_a_lone_finger_is_valid_where_it_was_or_is_seen_along_itself(
 
 
 @pytest.mark.usefixtures("tools_importable")
-@pytest.mark.parametrize(("condition", "scene"), [("clutter", 1), ("bump", 6), ("bump, tips hidden", 17)])
+@pytest.mark.parametrize(
+    ("condition", "scene"),
+    [
+        ("bump", 6),
+        pytest.param("bump, tips hidden", 17, marks=pytest.mark.slow("17 s; in free view it is in the default run")),
+    ],
+)
 def test_what_looks_like_a_lone_fingers_end_elsewhere_is_not_valid(condition: str, scene: int):
     """25 mm from it, in two of them, both of its corners were seen."""
     from benchmarks.integrity_runs import run_scene
@@ -354,7 +360,7 @@ def test_a_knock_is_found_though_both_corners_of_each_round_tip_do_not_show_in_o
 
 
 @pytest.mark.usefixtures("tools_importable")
-@pytest.mark.parametrize("knock_m", [-8e-3, -3e-3, 3e-3])
+@pytest.mark.parametrize("knock_m", [-8e-3, 3e-3])
 def test_a_knock_along_fingers_with_round_tips_is_found_and_told(knock_m: float):
     """Their sides lie where they lay, and are most of what is seen: only that no tip is seen there tells."""
     background = Background(kind="blobs", speed_m_per_s=0.05)
@@ -369,7 +375,7 @@ def test_a_knock_along_fingers_with_round_tips_is_found_and_told(knock_m: float)
 # --- fingers that flex ---
 
 
-@pytest.mark.parametrize("flex_m", [2e-4, 3e-4, 4e-4])
+@pytest.mark.parametrize("flex_m", [2e-4, 4e-4])
 @pytest.mark.parametrize("way", [-1.0, 1.0])
 def test_fingers_that_flex_alike_are_no_knock(flex_m: float, way: float):
     """As in gripping, by more than the report of the opening may be off: no single fault explains it."""

@@ -28,7 +28,7 @@ def wave(hertz: float, frames: int, direction: np.ndarray, phase: float = 0.7, f
     return out
 
 
-@pytest.mark.parametrize("hertz", [3.0, 4.4, 7.0, 12.3, 19.0, 25.0])
+@pytest.mark.parametrize("hertz", [3.0, 12.3, 25.0])
 @pytest.mark.parametrize("amplitude_m", [1e-4, 5e-4])
 def test_a_sinusoid_is_found_with_its_size_and_frequency(hertz: float, amplitude_m: float):
     seed, direction = int(hertz), amplitude_m * np.array([0.8, 0.6, 0.0])
@@ -50,12 +50,12 @@ def test_the_frequency_is_in_the_frames_own_time(frames_per_s: float):
     assert last.frequency_hz == pytest.approx(hertz, rel=0.01)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_noise_is_none(seed: int):
     assert not any(watched(noise(seed, 1000)))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("size", [10.0, 100.0, 1000.0])
 def test_a_step_is_none(seed: int, size: float):
     """Wherever it lies among the frames that are looked at."""
@@ -71,7 +71,7 @@ def test_a_creep_is_none(mm_per_min: float):
     assert not any(watched(shifts))
 
 
-@pytest.mark.parametrize("frame", [150, 160, 191])
+@pytest.mark.parametrize("frame", [150, 191])
 def test_a_wild_frame_is_none(frame: int):
     shifts = noise(2, 600)
     shifts[frame] += 1e4 * SIGMA
@@ -122,7 +122,7 @@ def loud(ratio: float, frames: int) -> np.ndarray:
     return wave(11.0, frames, amplitude_m * direction)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_vibration_has_six_times_the_variance_and_goes_on_down_to_three_times(seed: int):
     """Margins of a third for what 32 frames don't tell."""
     assert not any(watched(noise(seed, 600) + loud(4.0, 600), smallest_m=1e-9))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import socket
@@ -27,7 +26,6 @@ from support.headless import needs_chromium, picture_of
 from support.loopback import WAIT_S, free_endpoint, wait_until
 from support.network_daemon import ENVIRONMENT
 
-from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.record.recorder import RecordingSettings, ViewSettings
 from gripmon.record.write import ProcessRecorder, open_recorder
@@ -122,42 +120,6 @@ def test_another_process_sees_what_a_monitor_does(tmp_path: Path, enabled: bool)
         assert set().union(*map(seqs_of, files)) == judged, "the viewer's end was none of the file's"
 
 
-@pytest.mark.slow("5 s: a stalled recording process costs nothing either, in test_recording_faults")
-def test_a_viewer_that_stands_still_costs_no_frames(tmp_path: Path):
-    view = ViewSettings(port=free_port(), web_port=free_port(), memory_limit_bytes=10_000_000)
-    settings = recorded.settings(image_format="png", image_every=1, around_alert_s=0.0, queue_images=64)
-    recorder = live_recorder(tmp_path, view, settings)
-    rng = np.random.default_rng(1)
-    frames = 0
-
-    def offer(count: int) -> None:
-        nonlocal frames
-        for _ in range(count):
-            noise = rng.integers(0, 256, (recorded.HEIGHT_PX, recorded.WIDTH_PX), np.uint8)  # 77 kB
-            recorder.offer(recorded.frame(frames, noise), recorded.record(frames), lambda: None)
-            frames += 1
-        wait_until(lambda: recorder.frames_written == frames, "all on disk")
-
-    offer(1)
-    wait_until(lambda: listens(view.port), "the stream")
-    with receiver(view, tmp_path / "seen.rrd") as viewer:
-        wait_until(lambda: seqs_of(tmp_path / "seen.rrd"), "the viewer is there")
-        os.kill(viewer.pid, signal.SIGSTOP)
-        offer(600)
-        os.kill(viewer.pid, signal.SIGCONT)
-        last = frames
-
-        def goes_on() -> bool:
-            offer(10)
-            return max(seqs_of(tmp_path / "seen.rrd"), default=-1) >= last
-
-        wait_until(goes_on, "the viewer goes on")
-    recorder.close(timeout_s=60.0)
-    assert recorder.dropped == 0 and recorder.images_dropped == 0
-    (file,) = tmp_path.glob("live-*.rrd")
-    assert seqs_of(file) == seqs_of(file, "rig/camera/image") == set(range(frames))
-
-
 def test_a_live_view_that_cannot_be_served_costs_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -172,50 +134,6 @@ def test_a_live_view_that_cannot_be_served_costs_nothing_else(tmp_path: Path, ca
         recorder.close(timeout_s=60.0)
     (file,) = tmp_path.glob("live-*.rrd")
     assert seqs_of(file) == set(range(20)) and recorder.dropped == 0
-
-
-def refused(*arguments: str) -> str:
-    """The one line that a command says which can't start."""
-    environment = {k: v for k, v in ENVIRONMENT.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    done = subprocess.run([*GRIPMON, *arguments], capture_output=True, text=True, timeout=WAIT_S, env=environment)
-    assert done.returncode in (2, 3), done.stderr
-    (line,) = done.stderr.splitlines()
-    return line
-
-
-@pytest.mark.slow("7 s: words of the viewer's errors; that it shows is in the default run")
-def test_what_cannot_be_shown_is_said_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "text.rrd").write_text("no recording")
-    (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
-    for arguments, code, said in (
-        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run, or their folder"),
-        (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run, or their folder"),
-        (("text.rrd",), 2, f"{tmp_path}/text.rrd: isn't a recording; an .rrd file of gripmon's"),
-        (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
-    ):
-        assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == code
-        assert capsys.readouterr().err.splitlines() == [said]
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        port = other.getsockname()[1]
-        assert refused("view", str(tmp_path / "right.rrd"), "--web", "--port", str(port)) == (
-            f"--port {port}: is in use on 127.0.0.1; another port, or none for any"
-        )
-        config = monitor_config(tmp_path, port, free_port(), "{enabled: false}")
-        assert refused("run", str(config), "--view") == (
-            f"{config}: view.port: {port} is in use on 127.0.0.1; another port"
-        )
-        config = monitor_config(tmp_path, free_port(), port, "{enabled: false}")
-        assert refused("run", str(config), "--view", "web") == (
-            f"{config}: view.web_port: {port} is in use on 127.0.0.1; another port"
-        )
-        assert refused("run", str(config), "--view", "native") == "--view native: there is no display; web"
 
 
 @pytest.fixture(scope="module")

@@ -61,13 +61,6 @@ def curved_meshes(folder: Path) -> Array:
     return _at_work(folder, curved_fingers(), curved_fingers())
 
 
-def bevelled_boxes(folder: Path) -> Array:
-    """Boxes with bevels of 0.2 mm, which their CAD doesn't draw: :func:`_at_work`."""
-    from benchmarks.meshes import bevelled_fingers, box_fingers
-
-    return _at_work(folder, box_fingers(), bevelled_fingers(2e-4))
-
-
 def _at_work(folder: Path, drawn: Sequence[Any], real: Sequence[Any]) -> Array:
     """``finger0.stl`` and ``finger1.stl``, mm; ``robot.yaml``, the robot's hand/eye calibration; ``work``, in which the
     camera trembles by 0.05 mm.  True ``cam_T_grip`` (frames, 4, 4) at work.

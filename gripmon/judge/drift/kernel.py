@@ -2,7 +2,7 @@
 
 Values are m and rad or, after a whitening W of their covariance C with W C W' = 1, standard deviations.  What they are
 for stands in :mod:`~gripmon.judge.drift.sequential` and :mod:`~gripmon.judge.drift.statistics`.  What is learnt is
-changed in place.  Tests hold each function against that of its name in ``tests/support/by_numpy/drift.py``.
+changed in place.
 """
 
 from __future__ import annotations

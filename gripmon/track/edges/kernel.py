@@ -2,8 +2,7 @@
 
 k edgel hypotheses sorted by search line, n search lines, e edges of the gripper, g stretches of agreed points, m
 unknowns (m, rad).  Inside, everything has :data:`SIZE` unknowns: without a jaw the seventh has no derivative, and a
-prior that holds it at zero.  Tests hold the functions against those of their names in
-``tests/support/by_numpy/fit.py``, :func:`fit` against ``fit_irls``.
+prior that holds it at zero.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The geometry of a prediction in machine code.
 
 n samples, s places along each search line, r rows of them, e edges of the gripper, v of them sampled; points in the
-camera frame (m), images of them in px.  Tests hold each function against that of its name in
-``tests/support/by_numpy/prediction.py``.
+camera frame (m), images of them in px.
 """
 
 from __future__ import annotations

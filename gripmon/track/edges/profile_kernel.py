@@ -1,8 +1,7 @@
 """Search lines and edgel hypotheses in machine code.
 
 n search lines of s samples, k edgel hypotheses, e edges of the gripper; grey levels, and px of the image or of the
-zoomed one. Tests hold each function against that of its name in ``tests/support/by_numpy/profiles.py``, but
-:func:`worth` against ``weigh``.
+zoomed one.
 """
 
 from __future__ import annotations
