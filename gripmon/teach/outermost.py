@@ -8,6 +8,8 @@ and go.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -68,10 +70,11 @@ class Outside:
         there = self._at(self._stays, places) & along
         found = np.where(there, away, 0.0).max(axis=1, initial=0.0)
         # By chance an edge is there at a few stations.
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(found > 0.0, _NEIGHBOURS // 2, mode="wrap"), _NEIGHBOURS)
+        padded = np.pad(found > 0.0, _NEIGHBOURS // 2, mode="wrap")
+        around = np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS)
         return np.where(around.mean(axis=1) >= LEAST_USABLE, found, 0.0)
 
-    def _at(self, plane: NDArray, uv_px: Array) -> NDArray:
+    def _at(self, plane: NDArray[Any], uv_px: Array) -> NDArray[Any]:
         """The values of a plane of the edges' size at places (..., 2) of the images."""
         height, width = plane.shape
         at = np.rint((uv_px + 0.5) * self._scale - 0.5).astype(int)

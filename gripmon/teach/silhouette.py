@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -44,6 +44,10 @@ FEWEST_CLEAR = 4
 FEWEST_BACKGROUNDS = 2
 """Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
 within a background the grey level on the finger's side changes, and the image isn't used there."""
+RISEN = 0.85
+"""Part of a transition to the background at which it has ended: textures leave a tenth or so of it open."""
+RISE_STATIONS = 9
+"""Stations along which a transition's end is looked for: the shortest edge that is measured."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -71,7 +75,8 @@ class Transitions:
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
     edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
     each image's transitions over that of all; ``clear`` and
-    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
+    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey; ``rise_px`` (s,), how
+    much farther out the transition ends than that of one blurred edge, the median along some stations.
     """
 
     offset_px: Array
@@ -84,6 +89,7 @@ class Transitions:
     clear: NDArray[np.intp]
     different: NDArray[np.intp]
     level: Array
+    rise_px: Array
 
 
 def folds_of(count: int) -> NDArray[np.intp]:
@@ -165,15 +171,18 @@ def measure_transitions(
     d -= (light / usual)[:, :, None] * finger[None]
     sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
-    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
-    weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
     shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
+    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.  Limited is what
+    # contrasts differ by: of a dark finger before bright backgrounds all would be the same.
+    weight = contrast - shading * contrast.mean(axis=0)
+    weight = weight / np.maximum(1.0, np.abs(weight) / 60.0)
     weight = weight - shading * weight.mean(axis=0)
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
+    usable &= total_lower > (FEWEST_CONTRASTS * noise) ** 2
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
     if blur_px is None:
@@ -189,7 +198,16 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
+    rise_px = _rise(transition, s, offset, blur_px)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual, rise_px)
+
+
+def _rise(transition: Array, s: Array, offset: Array, blur_px: float) -> Array:
+    """How much farther out (stations,) transitions reach :data:`RISEN` than that of one blurred edge at ``offset``."""
+    usual = median_filter(transition, (RISE_STATIONS, 1), mode="nearest")
+    there = (usual >= RISEN) & (s >= offset[:, None])
+    first = np.where(there.any(axis=1), there.argmax(axis=1), len(s) - 1)
+    return np.asarray(s[first] - offset - float(ndtri(RISEN)) * blur_px)
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

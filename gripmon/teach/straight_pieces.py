@@ -38,6 +38,9 @@ WORST_SIGMA_PX = 1.0
 work reach 3 px to either side."""
 LEAST_USABLE = 0.6
 """Least part of a piece's stations that are measured: what lies between others is bridged, not the most of it."""
+MOST_RISE_PX = 1.5
+"""Largest distance by which a piece's transition ends farther out than that of one edge: two edges of equal steps, 3 px
+apart, give 1.1 px, and a line between them is as far beside the outline."""
 LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
@@ -184,19 +187,22 @@ def fit_chains(
     noise: float,
     points: Array,
     outward: Array,
+    rise_px: Array,
     closed: bool,
     blur_px: float,
 ) -> list[Chain]:
     """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
-    gripper.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
+    gripper, ``rise_px`` (n,) of their transitions.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
     """
     if closed:
-        points, outward = _from_a_corner(points, outward)
+        points, outward, rise_px = _from_a_corner(points, outward, rise_px)
     ideal = to_ideal_px(camera, points)
     cuts = split(ideal)
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
+        if float(np.median(rise_px[part])) > MOST_RISE_PX:
+            return None
         return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
 
     spans = list(itertools.pairwise(cuts))
@@ -326,12 +332,12 @@ def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Arra
     return True
 
 
-def _from_a_corner(points: Array, outward: Array) -> tuple[Array, Array]:
+def _from_a_corner(points: Array, outward: Array, rise_px: Array) -> tuple[Array, Array, Array]:
     """Start a closed chain where it turns most, so that no piece is cut in two."""
     ahead, behind = np.roll(points, -8, axis=0) - points, points - np.roll(points, 8, axis=0)
     turn = np.abs(ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0])
     k = int(turn.argmax())
-    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0)
+    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0), np.roll(rise_px, -k)
 
 
 def _line_through(p: Array) -> tuple[Array, Array]:
@@ -383,8 +389,8 @@ def _measured(
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
     rms_px = float(np.sqrt(np.square(residual).mean()))
-    ends = np.where(reached[:, None], ends, shown)
-    return _Line(line[0], line[1], normals, distances, rms_px, float(inlier.mean()), ends, shown)
+    reach = np.where(reached[:, None], ends, shown)
+    return _Line(line[0], line[1], normals, distances, rms_px, float(inlier.mean()), reach, shown)
 
 
 def _followed(inlier: NDArray[np.bool_]) -> tuple[int, int]:
