@@ -233,7 +233,7 @@ def _fingers(
         found = replace(
             found,
             offset_px=found.offset_px + beyond_px,
-            usable=found.usable & outside.is_open(stations, found.offset_px + beyond_px),
+            usable=found.usable & outside.is_free(stations, found.offset_px + beyond_px, blur_px),
         )
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         rise_px = np.maximum(found.rise_px - beyond_px, 0.0)

@@ -8,6 +8,7 @@ and go.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -23,6 +24,10 @@ BESIDE_PX = 2.5
 """Distance beyond an edge from which another one is told from it: three sigmas of a blur of 0.8 px."""
 BEYOND_PX = 8.0
 """Distance within which the outermost edge is measured instead: a search line's reach."""
+GRADIENT_BLUR_PX = 1.5
+"""Blur of an edge where edges that stay are looked for: two filters of a pixel."""
+TAIL = 3.0
+"""Blurs from an edge at which nothing of it is left: a 90th of its slope, less than what counts as an edge."""
 OPENING_PX = 3.0
 """Radius of a disc that reaches what is background between edges that stay: it doesn't pass gaps that the length of the
 shortest piece hides."""
@@ -39,6 +44,7 @@ class Outside:
     def __init__(self, edges: Edges, still: Bits) -> None:
         self._scale = np.array(edges.share.shape[::-1]) / np.array(still.shape[::-1])
         self._stays, self._across_rad = _without_specks(edges.stays), edges.across_rad
+        self._stays_near = np.asarray(edges.share > edges.limit)
         self._open = self._opened(edges, still)
 
     def _opened(self, edges: Edges, still: Bits) -> Bits:
@@ -55,20 +61,27 @@ class Outside:
         away = cv2.distanceTransform((~background[labels]).astype(np.uint8), cv2.DIST_L2, 5)
         return np.asarray(away <= radius + _half_diagonal(radius))
 
-    def is_open(self, stations: Stations, offset_px: Array) -> NDArray[np.bool_]:
-        """Whether background begins beyond edges at ``offset_px`` (s,) along the stations' normals."""
-        return self._at(self._open, stations.uv_px + (offset_px + 2.0 * BESIDE_PX)[:, None] * stations.normal)
+    def is_free(self, stations: Stations, offset_px: Array, blur_px: float) -> NDArray[np.bool_]:
+        """Whether nothing stays beyond edges of a blur at ``offset_px`` (s,) along the stations' normals, where
+        background begins.
+        """
+        is_open = self._at(self._open, stations.uv_px + (offset_px + 2.0 * BESIDE_PX)[:, None] * stations.normal)
+        from_px = TAIL * math.hypot(blur_px, GRADIENT_BLUR_PX)
+        return is_open & (self._farthest(self._stays_near, stations, offset_px, from_px) == 0.0)
 
     def beyond_px(self, stations: Stations, offset_px: Array) -> Array:
         """How far (s,) beyond edges at ``offset_px`` (s,) the outermost edge along them is that stays; 0 where there is
         none.
         """
-        away = np.arange(BESIDE_PX, BEYOND_PX + 0.5 * _STEP_PX, _STEP_PX)
+        return self._farthest(self._stays, stations, offset_px, BESIDE_PX)
+
+    def _farthest(self, stays: Bits, stations: Stations, offset_px: Array, from_px: float) -> Array:
+        """How far (s,) beyond ``offset_px`` something along an edge stays, ``from_px`` at least; 0 for nothing."""
+        away = np.arange(from_px, BEYOND_PX + 0.5 * _STEP_PX, _STEP_PX)
         places = stations.uv_px[:, None] + (offset_px[:, None] + away)[..., None] * stations.normal[:, None]
         normal_rad = np.arctan2(stations.normal[:, 1], stations.normal[:, 0])
         along = np.abs(np.cos(self._at(self._across_rad, places) - normal_rad[:, None])) > np.cos(_ALONG_RAD)
-        there = self._at(self._stays, places) & along
-        found = np.where(there, away, 0.0).max(axis=1, initial=0.0)
+        found = np.where(self._at(stays, places) & along, away, 0.0).max(axis=1, initial=0.0)
         # By chance an edge is there at a few stations.
         padded = np.pad(found > 0.0, _NEIGHBOURS // 2, mode="wrap")
         around = np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS)

@@ -37,7 +37,7 @@ WORST_SIGMA_PX = 1.0
 """Standard deviation of a piece's ends, from the scatter over the images, from which it is left out: search lines at
 work reach 3 px to either side."""
 LEAST_USABLE = 0.6
-"""Least part of a piece's stations that are measured: what lies between others is bridged, not the most of it."""
+"""Least part of a piece's stations that are measured, and lie on one line: what lies between others is bridged, not the most of it."""
 MOST_RISE_PX = 1.5
 """Largest distance by which a piece's transition ends farther out than that of one edge: two edges of equal steps, 3 px
 apart, give 1.1 px, and a line between them is as far beside the outline."""
@@ -192,7 +192,8 @@ def fit_chains(
     blur_px: float,
 ) -> list[Chain]:
     """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
-    gripper, ``rise_px`` (n,) of their transitions.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
+    gripper, ``rise_px`` (n,) of their transitions.  Several chains where pieces between them can't be measured, none
+    where no piece of at least 8 px is left.
     """
     if closed:
         points, outward, rise_px = _from_a_corner(points, outward, rise_px)
@@ -317,7 +318,7 @@ def _goes_on(
         return False
     found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
     off = np.abs(found.offset_px[found.usable])
-    return bool(len(off) and float(np.quantile(off, 0.9)) < within_px)
+    return len(off) >= max(1.0, LEAST_USABLE * len(found.usable)) and float(np.quantile(off, 0.9)) < within_px
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
@@ -379,6 +380,8 @@ def _measured(
     shown = foot + ((shown - foot) @ way)[:, None] * way
     margin = np.linalg.norm(at[[0, -1]] - ends, axis=1) + 0.5
     reached = np.linalg.norm(shown - ends, axis=1) <= margin
+    if np.count_nonzero(inlier) < LEAST_USABLE * len(inlier):
+        return None
     residual = at[inlier] @ line[0] - line[1]
     if float(np.sqrt(np.square(residual).mean())) > WORST_RMS_PX:
         return None
@@ -458,9 +461,10 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         a, b = k, (k + 1) % count
         joint = 0.5 * (lines[a].ends[1] + lines[b].ends[0])
         met = _meet(normals[a], distances[a], normals[b], distances[b])
-        if not _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal):
+        smooth = _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal)
+        if not smooth or _apart_px(lines[a], lines[b], joint) > _MOST_APART_PX:
             vertices.append(met)
-            corner.append(True)
+            corner.append(not smooth)
             continue
         # Pieces of a curve meet at their common point: the intersection of nearly parallel lines is uncertain.
         feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
