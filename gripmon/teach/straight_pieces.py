@@ -37,7 +37,8 @@ WORST_SIGMA_PX = 1.0
 """Standard deviation of a piece's ends, from the scatter over the images, from which it is left out: search lines at
 work reach 3 px to either side."""
 LEAST_USABLE = 0.6
-"""Least part of a piece's stations that are measured, and lie on one line: what lies between others is bridged, not the most of it."""
+"""Least part of a piece's stations that are measured, and lie on one line: what is between others is bridged, not the
+most of it."""
 MOST_RISE_PX = 1.5
 """Largest distance by which a piece's transition ends farther out than that of one edge: two edges of equal steps, 3 px
 apart, give 1.1 px, and a line between them is as far beside the outline."""
