@@ -26,8 +26,8 @@ BEYOND_PX = 8.0
 """Distance within which the outermost edge is measured instead: a search line's reach."""
 GRADIENT_BLUR_PX = 1.5
 """Blur of an edge where edges that stay are looked for: two filters of a pixel."""
-TAIL = 4.0
-"""Blurs from an edge at which nothing of it is left: a 3,000th of its slope."""
+TAIL = 3.0
+"""Blurs from an edge at which nothing of it is left: a 90th of its slope, less than what counts as an edge."""
 OPENING_PX = 3.0
 """Radius of a disc that reaches what is background between edges that stay: it doesn't pass gaps that the length of the
 shortest piece hides."""

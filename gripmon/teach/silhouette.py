@@ -212,8 +212,8 @@ def _rise(transition: Array, s: Array, offset: Array, blur_px: float) -> Array:
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], Array]:
-    """How many images (s,) show a clear contrast (n, s) at each station, and before how many different backgrounds (s,),
-    0 without an image.
+    """How many images (s,) show a clear contrast (n, s) at each station, and before how many different backgrounds,
+    (s,), 0 without an image.
 
     Two images are as much of one background as ``exp(-z²/2)``, their contrasts half a clear contrast times z apart; the
     inverse of its mean over all pairs is the number of backgrounds, each as often as the others, that are as different
