@@ -45,7 +45,7 @@ FEWEST_BACKGROUNDS = 1.5
 images or more.  Beside a tone's border within a finger there is always the same; within a background the grey level on
 the finger's side changes, and the image isn't used there."""
 RISEN = 0.85
-"""Part of a transition to the background at which it has ended: textures leave a tenth or so of it open."""
+"""Part of a transition to the background at which it has ended; before plain backgrounds no texture leaves more open."""
 RISE_STATIONS = 9
 """Stations along which a transition's end is looked for: the shortest edge that is measured."""
 FROM_BORDER_PX = 6.0
@@ -199,7 +199,10 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    rise_px = _rise(transition, s, offset, blur_px)
+    # What is uneven by a share of what backgrounds differ by takes no larger part of the transition away.
+    uneven = np.sqrt(np.where(sound[:, :, None], d, 0.0)[:, :, beyond].var(axis=2).sum(axis=0) / count)
+    plain = uneven < (1.0 - RISEN) * np.sqrt(np.square(weight).sum(axis=0) / count)
+    rise_px = np.where(plain, _rise(transition, s, offset, blur_px), 0.0)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual, rise_px)
 
 
