@@ -45,7 +45,7 @@ FEWEST_BACKGROUNDS = 1.5
 images or more.  Beside a tone's border within a finger there is always the same; within a background the grey level on
 the finger's side changes, and the image isn't used there."""
 RISEN = 0.85
-"""Part of a transition to the background at which it has ended; before plain backgrounds no texture leaves more open."""
+"""Part of a transition to the background at which it has ended: before plain ones no texture leaves more open."""
 RISE_STATIONS = 9
 """Stations along which a transition's end is looked for: the shortest edge that is measured."""
 FROM_BORDER_PX = 6.0

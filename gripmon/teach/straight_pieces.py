@@ -203,7 +203,8 @@ def fit_chains(
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
-        if float(np.median(rise_px[part])) > MOST_RISE_PX:
+        length_px = float(np.linalg.norm(ideal[last] - ideal[first]))
+        if last - first + 1 < LEAST_USABLE * length_px or float(np.median(rise_px[part])) > MOST_RISE_PX:
             return None
         return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
 
