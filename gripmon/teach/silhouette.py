@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -37,13 +37,17 @@ FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
 CLEAR_NOISES = 6.0
-"""Contrast over a pixel's noise, at least a grey level, from which an image alone shows the finger's border there; and
-grey levels of two backgrounds so far apart are different ones."""
+"""Contrast over a pixel's noise, at least a grey level, from which an image alone shows the finger's border there."""
 FEWEST_CLEAR = 4
 """Least number of images that show the border so: one of five may show something else there."""
-FEWEST_BACKGROUNDS = 2
-"""Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
-within a background the grey level on the finger's side changes, and the image isn't used there."""
+FEWEST_BACKGROUNDS = 1.5
+"""Least number of different backgrounds among these (:func:`backgrounds_beside`): two, one of them in a fifth of the
+images or more.  Beside a tone's border within a finger there is always the same; within a background the grey level on
+the finger's side changes, and the image isn't used there."""
+RISEN = 0.85
+"""Part of a transition to the background at which it has ended: before plain ones no texture leaves more open."""
+RISE_STATIONS = 9
+"""Stations along which a transition's end is looked for: the shortest edge that is measured."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -71,7 +75,8 @@ class Transitions:
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
     edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
     each image's transitions over that of all; ``clear`` and
-    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
+    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey; ``rise_px`` (s,), how
+    much farther out the transition ends than that of one blurred edge, the median along some stations.
     """
 
     offset_px: Array
@@ -82,8 +87,9 @@ class Transitions:
     worth: Array
     sharpness: Array
     clear: NDArray[np.intp]
-    different: NDArray[np.intp]
+    different: Array
     level: Array
+    rise_px: Array
 
 
 def folds_of(count: int) -> NDArray[np.intp]:
@@ -165,15 +171,19 @@ def measure_transitions(
     d -= (light / usual)[:, :, None] * finger[None]
     sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
-    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
-    weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
     shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
-    weight = weight - shading * weight.mean(axis=0)
+    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.  Limited is what
+    # contrasts differ by: of a dark finger before bright backgrounds all would be the same.
+    count = np.maximum(sound.sum(axis=0), 1)
+    weight = contrast - shading * contrast.sum(axis=0) / count
+    weight = np.where(sound, weight / np.maximum(1.0, np.abs(weight) / 60.0), 0.0)
+    weight = np.where(sound, weight - shading * weight.sum(axis=0) / count, 0.0)
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
+    usable &= total_lower > (FEWEST_CONTRASTS * noise) ** 2
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
     if blur_px is None:
@@ -189,21 +199,38 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
+    # What is uneven by a share of what backgrounds differ by takes no larger part of the transition away.
+    farthest = np.where(sound[:, :, None], d, 0.0)[:, :, s >= reach - 2.0]
+    uneven = np.sqrt(farthest.var(axis=2).sum(axis=0) / count)
+    plain = uneven < (1.0 - RISEN) * np.sqrt(np.square(weight).sum(axis=0) / count)
+    rise_px = np.where(plain, _rise(transition, s, offset, blur_px), 0.0)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual, rise_px)
 
 
-def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """How many images (s,) show a clear contrast (n, s) at each station, and how many different backgrounds (s,) these
-    have: ranges of grey levels, as wide as a clear contrast is high, that hold some.
+def _rise(transition: Array, s: Array, offset: Array, blur_px: float) -> Array:
+    """How much farther out (stations,) transitions reach :data:`RISEN` than that of one blurred edge at ``offset``."""
+    usual = median_filter(transition, (RISE_STATIONS, 1), mode="nearest")
+    there = (usual >= RISEN) & (s >= offset[:, None])
+    first = np.where(there.any(axis=1), there.argmax(axis=1), len(s) - 1)
+    return np.asarray(s[first] - offset - float(ndtri(RISEN)) * blur_px)
+
+
+def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], Array]:
+    """How many images (s,) show a clear contrast (n, s) at each station, and before how many different backgrounds,
+    (s,), 0 without an image.
+
+    Two images are as much of one background as ``exp(-z²/2)``, their contrasts half a clear contrast times z apart; the
+    inverse of its mean over all pairs is the number of backgrounds, each as often as the others, that are as different
+    (Leinster and Cobbold 2012, of order 2).  Noise alone gives 1.1, and 1.4 where it is twice what is thought,
+    however many images there are; one image in five before another background gives 1.5, two 1.9.
     """
     least = CLEAR_NOISES * max(noise, 1.0)
     clear = np.abs(contrast) > least
-    levels = np.sort(np.where(clear, contrast, np.inf), axis=0)
-    lowest = np.where(np.isfinite(levels[0]), levels[0], 0.0)
-    # Of many images the levels leave no gaps, so that their range is divided.
-    steps = np.floor((np.where(np.isfinite(levels), levels, lowest) - lowest) / least)
-    gaps = np.diff(steps, axis=0) > 0.0
-    return np.count_nonzero(clear, axis=0), np.count_nonzero(gaps, axis=0) + clear.any(axis=0)
+    alike = np.zeros(contrast.shape[1])
+    for own, there in zip(contrast, clear, strict=True):
+        alike += np.where(clear & there, np.exp(-2.0 * np.square((contrast - own) / least)), 0.0).sum(axis=0)
+    count = np.count_nonzero(clear, axis=0)
+    return count, np.square(count) / np.maximum(alike, 1.0)
 
 
 def _usual(finger: Array, within: NDArray[np.bool_]) -> Array:

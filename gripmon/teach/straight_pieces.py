@@ -37,12 +37,18 @@ WORST_SIGMA_PX = 1.0
 """Standard deviation of a piece's ends, from the scatter over the images, from which it is left out: search lines at
 work reach 3 px to either side."""
 LEAST_USABLE = 0.6
-"""Least part of a piece's stations that are measured: what lies between others is bridged, not the most of it."""
+"""Least part of a piece's stations that are measured, and lie on one line: what is between others is bridged, not the
+most of it."""
+MOST_RISE_PX = 1.5
+"""Largest distance by which a piece's transition ends farther out than that of one edge: two edges of equal steps, 3 px
+apart, give 1.1 px, and a line between them is as far beside the outline."""
 LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
 """Distance from a corner within which the blur of its two edges mixes."""
 _GAP_PX = 12.0
+_MOST_APART_PX = 2.0 * WORST_RMS_PX
+"""Largest distance between two pieces of a curve at their joint, of which each is missed by half."""
 _OUTLIER_PX = 1.0
 _MOST_POINTS = 1500
 
@@ -161,7 +167,10 @@ def _scatter(p: Array) -> float:
 
 @dataclass(frozen=True)
 class _Line:
-    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points."""
+    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points;
+    ``ends`` (2, 2), between which it is their line, as far as the next piece; ``shown`` (2, 2), the first and the
+    last of them.
+    """
 
     normal: Array
     distance: float
@@ -169,6 +178,8 @@ class _Line:
     fold_distances: Array
     rms_px: float
     seen: float
+    ends: Array
+    shown: Array
 
 
 def fit_chains(
@@ -177,19 +188,24 @@ def fit_chains(
     noise: float,
     points: Array,
     outward: Array,
+    rise_px: Array,
     closed: bool,
     blur_px: float,
 ) -> list[Chain]:
     """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
-    gripper.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
+    gripper, ``rise_px`` (n,) of their transitions.  Several chains where pieces between them can't be measured, none
+    where no piece of at least 8 px is left.
     """
     if closed:
-        points, outward = _from_a_corner(points, outward)
+        points, outward, rise_px = _from_a_corner(points, outward, rise_px)
     ideal = to_ideal_px(camera, points)
     cuts = split(ideal)
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
+        length_px = float(np.linalg.norm(ideal[last] - ideal[first]))
+        if last - first + 1 < LEAST_USABLE * length_px or float(np.median(rise_px[part])) > MOST_RISE_PX:
+            return None
         return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
 
     spans = list(itertools.pairwise(cuts))
@@ -206,11 +222,12 @@ def fit_chains(
             k += 1
 
     def joined(before: _Found, after: _Found) -> bool:
-        ends = ideal[before[0][1]], ideal[after[0][0]]
-        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX:
-            return True
-        # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
         (_, one), (_, other) = before, after
+        ends = one.ends[1], other.ends[0]
+        gap_px = float(np.linalg.norm(ends[1] - ends[0]))
+        if gap_px <= _GAP_PX and _is_smooth(before, after, ideal):
+            return _apart_px(one, other, 0.5 * (ends[0] + ends[1])) <= _MOST_APART_PX
+        # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
         distances = np.array([[one.distance], [other.distance]])
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
         return all(
@@ -303,7 +320,7 @@ def _goes_on(
         return False
     found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
     off = np.abs(found.offset_px[found.usable])
-    return bool(len(off) and float(np.quantile(off, 0.9)) < within_px)
+    return len(off) >= max(1.0, LEAST_USABLE * len(found.usable)) and float(np.quantile(off, 0.9)) < within_px
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
@@ -318,12 +335,12 @@ def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Arra
     return True
 
 
-def _from_a_corner(points: Array, outward: Array) -> tuple[Array, Array]:
+def _from_a_corner(points: Array, outward: Array, rise_px: Array) -> tuple[Array, Array, Array]:
     """Start a closed chain where it turns most, so that no piece is cut in two."""
     ahead, behind = np.roll(points, -8, axis=0) - points, points - np.roll(points, 8, axis=0)
     turn = np.abs(ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0])
     k = int(turn.argmax())
-    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0)
+    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0), np.roll(rise_px, -k)
 
 
 def _line_through(p: Array) -> tuple[Array, Array]:
@@ -361,6 +378,12 @@ def _measured(
         way *= np.sign(way @ (ends[1] - ends[0]))
         foot = line[0] * line[1]
         ends = foot + float((ends[0] - foot) @ way) * way, foot + float((ends[1] - foot) @ way) * way
+    shown = at[list(_followed(inlier))]
+    shown = foot + ((shown - foot) @ way)[:, None] * way
+    margin = np.linalg.norm(at[[0, -1]] - ends, axis=1) + 0.5
+    reached = np.linalg.norm(shown - ends, axis=1) <= margin
+    if np.count_nonzero(inlier) < LEAST_USABLE * len(inlier):
+        return None
     residual = at[inlier] @ line[0] - line[1]
     if float(np.sqrt(np.square(residual).mean())) > WORST_RMS_PX:
         return None
@@ -370,7 +393,23 @@ def _measured(
     at_ends = jackknife_sigma(normals @ np.transpose(ends) - distances[:, None])
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
-    return _Line(line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean()))
+    rms_px = float(np.sqrt(np.square(residual).mean()))
+    reach = np.where(reached[:, None], ends, shown)
+    return _Line(line[0], line[1], normals, distances, rms_px, float(inlier.mean()), reach, shown)
+
+
+def _followed(inlier: NDArray[np.bool_]) -> tuple[int, int]:
+    """The first and the last station between which a piece's stations (s,), a pixel apart, lie on its line: where the
+    shortest piece of them would be measured.
+    """
+    size = min(int(SHORTEST_PIECE_PX), len(inlier))
+    enough = np.convolve(inlier, np.ones(size), "valid") >= LEAST_USABLE * size
+    at = np.flatnonzero(inlier)
+    if enough.any():
+        begun = int(enough.argmax())
+        ended = len(inlier) - 1 - int(enough[::-1].argmax())
+        at = at[(at >= begun) & (at <= ended)]
+    return int(at[0]), int(at[-1])
 
 
 def _stations_on(
@@ -418,16 +457,16 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     distances = np.stack([np.append(line.distance, line.fold_distances) for line in lines])
     vertices, corner = [], []
     if not closed:
-        vertices.append(_foot(normals[0], distances[0], ideal[spans[0][0]]))
+        vertices.append(_foot(normals[0], distances[0], lines[0].shown[0]))
         corner.append(False)
     for k in range(count if closed else count - 1):
         a, b = k, (k + 1) % count
-        joint = 0.5 * (ideal[spans[a][1]] + ideal[spans[b][0]])
-        shorter = min(float(np.linalg.norm(ideal[last] - ideal[first])) for first, last in (spans[a], spans[b]))
+        joint = 0.5 * (lines[a].ends[1] + lines[b].ends[0])
         met = _meet(normals[a], distances[a], normals[b], distances[b])
-        if shorter * _turn(normals[a, 0], normals[b, 0]) / 8.0 > CORNER_SAG_PX:
+        smooth = _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal)
+        if not smooth or _apart_px(lines[a], lines[b], joint) > _MOST_APART_PX:
             vertices.append(met)
-            corner.append(True)
+            corner.append(not smooth)
             continue
         # Pieces of a curve meet at their common point: the intersection of nearly parallel lines is uncertain.
         feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
@@ -435,7 +474,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
         corner.append(False)
     if not closed:
-        vertices.append(_foot(normals[-1], distances[-1], ideal[spans[-1][1]]))
+        vertices.append(_foot(normals[-1], distances[-1], lines[-1].shown[1]))
         corner.append(False)
     if closed:
         vertices, corner = vertices[-1:] + vertices[:-1], corner[-1:] + corner[:-1]
@@ -443,6 +482,18 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     uv = from_ideal_px(camera, stacked.reshape(-1, 2)).reshape(stacked.shape)
     rms = np.array([line.rms_px for line in lines])
     return Chain(uv[0], uv[1:], closed, np.array(corner), rms)
+
+
+def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
+    """Whether two pieces approximate a curve, instead of meeting in a corner."""
+    shorter_px = min(float(np.linalg.norm(ideal[last] - ideal[first])) for (first, last), _ in (before, after))
+    return shorter_px * _turn(before[1].normal, after[1].normal) / 8.0 <= CORNER_SAG_PX
+
+
+def _apart_px(one: _Line, other: _Line, at: Array) -> float:
+    """How far two lines are from each other at a place."""
+    feet = [line.normal * (float(line.normal @ at) - line.distance) for line in (one, other)]
+    return float(np.linalg.norm(feet[0] - feet[1]))
 
 
 def _turn(a: Array, b: Array) -> float:
