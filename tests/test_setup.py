@@ -10,6 +10,7 @@ import math
 import shutil
 import threading
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ def pictures(folder: Path) -> list[Image]:
     return [image for image in out if image is not None]
 
 
+@cache
 def sightings(folder: Path) -> list[Sighting]:
     seen = [Viewer(TARGET).look(image).sighting for image in pictures(folder)]
     return [each for each in seen if isinstance(each, Sighting)]
