@@ -200,8 +200,7 @@ def measure_transitions(
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     # What is uneven by a share of what backgrounds differ by takes no larger part of the transition away.
-    farthest = np.where(sound[:, :, None], d, 0.0)[:, :, s >= reach - 2.0]
-    uneven = np.sqrt(farthest.var(axis=2).sum(axis=0) / count)
+    uneven = np.sqrt(np.where(sound[:, :, None], d, 0.0)[:, :, beyond].var(axis=2).sum(axis=0) / count)
     plain = uneven < (1.0 - RISEN) * np.sqrt(np.square(weight).sum(axis=0) / count)
     rise_px = np.where(plain, _rise(transition, s, offset, blur_px), 0.0)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual, rise_px)
