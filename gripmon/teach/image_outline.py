@@ -236,13 +236,12 @@ def _fingers(
             usable=found.usable & outside.is_free(stations, found.offset_px + beyond_px, blur_px),
         )
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
-        rise_px = np.maximum(found.rise_px - beyond_px, 0.0)
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
         along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
-                camera, matte.images, matte.noise, points[run], stations.normal[run], rise_px[run], closed, blur_px
+                camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
             )
         step()
     centres_px = [np.argwhere(part)[:, ::-1].mean(axis=0) for part in parts.fingers]

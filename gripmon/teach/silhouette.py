@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -44,10 +44,6 @@ FEWEST_BACKGROUNDS = 1.5
 """Least number of different backgrounds among these (:func:`backgrounds_beside`): two, one of them in a fifth of the
 images or more.  Beside a tone's border within a finger there is always the same; within a background the grey level on
 the finger's side changes, and the image isn't used there."""
-RISEN = 0.85
-"""Part of a transition to the background at which it has ended: before plain ones no texture leaves more open."""
-RISE_STATIONS = 9
-"""Stations along which a transition's end is looked for: the shortest edge that is measured."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -75,8 +71,7 @@ class Transitions:
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
     edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
     each image's transitions over that of all; ``clear`` and
-    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey; ``rise_px`` (s,), how
-    much farther out the transition ends than that of one blurred edge, the median along some stations.
+    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
     """
 
     offset_px: Array
@@ -89,7 +84,6 @@ class Transitions:
     clear: NDArray[np.intp]
     different: Array
     level: Array
-    rise_px: Array
 
 
 def folds_of(count: int) -> NDArray[np.intp]:
@@ -199,20 +193,7 @@ def measure_transitions(
         ]
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
-    # What is uneven by a share of what backgrounds differ by takes no larger part of the transition away.
-    farthest = np.where(sound[:, :, None], d, 0.0)[:, :, s >= reach - 2.0]
-    uneven = np.sqrt(farthest.var(axis=2).sum(axis=0) / count)
-    plain = uneven < (1.0 - RISEN) * np.sqrt(np.square(weight).sum(axis=0) / count)
-    rise_px = np.where(plain, _rise(transition, s, offset, blur_px), 0.0)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual, rise_px)
-
-
-def _rise(transition: Array, s: Array, offset: Array, blur_px: float) -> Array:
-    """How much farther out (stations,) transitions reach :data:`RISEN` than that of one blurred edge at ``offset``."""
-    usual = median_filter(transition, (RISE_STATIONS, 1), mode="nearest")
-    there = (usual >= RISEN) & (s >= offset[:, None])
-    first = np.where(there.any(axis=1), there.argmax(axis=1), len(s) - 1)
-    return np.asarray(s[first] - offset - float(ndtri(RISEN)) * blur_px)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], Array]:

@@ -39,9 +39,6 @@ work reach 3 px to either side."""
 LEAST_USABLE = 0.6
 """Least part of a piece's stations that are measured, and lie on one line: what is between others is bridged, not the
 most of it."""
-MOST_RISE_PX = 1.5
-"""Largest distance by which a piece's transition ends farther out than that of one edge: two edges of equal steps, 3 px
-apart, give 1.1 px, and a line between them is as far beside the outline."""
 LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
@@ -188,23 +185,21 @@ def fit_chains(
     noise: float,
     points: Array,
     outward: Array,
-    rise_px: Array,
     closed: bool,
     blur_px: float,
 ) -> list[Chain]:
     """Pieces and vertices of a chain of edge points (n, 2) in the image; ``outward`` (n, 2): the normals away from the
-    gripper, ``rise_px`` (n,) of their transitions.  Several chains where pieces between them can't be measured, none
-    where no piece of at least 8 px is left.
+    gripper.  Several chains where pieces between them can't be measured, none where no piece of at least 8 px is left.
     """
     if closed:
-        points, outward, rise_px = _from_a_corner(points, outward, rise_px)
+        points, outward = _from_a_corner(points, outward)
     ideal = to_ideal_px(camera, points)
     cuts = split(ideal)
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
         length_px = float(np.linalg.norm(ideal[last] - ideal[first]))
-        if last - first + 1 < LEAST_USABLE * length_px or float(np.median(rise_px[part])) > MOST_RISE_PX:
+        if last - first + 1 < LEAST_USABLE * length_px:
             return None
         return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
 
@@ -335,12 +330,12 @@ def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Arra
     return True
 
 
-def _from_a_corner(points: Array, outward: Array, rise_px: Array) -> tuple[Array, Array, Array]:
+def _from_a_corner(points: Array, outward: Array) -> tuple[Array, Array]:
     """Start a closed chain where it turns most, so that no piece is cut in two."""
     ahead, behind = np.roll(points, -8, axis=0) - points, points - np.roll(points, 8, axis=0)
     turn = np.abs(ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0])
     k = int(turn.argmax())
-    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0), np.roll(rise_px, -k)
+    return np.roll(points, -k, axis=0), np.roll(outward, -k, axis=0)
 
 
 def _line_through(p: Array) -> tuple[Array, Array]:
