@@ -34,7 +34,7 @@ from gripmon.teach.from_images import GripperFromImages, gripper_from_images
 from gripmon.teach.image_borders import Border
 from gripmon.teach.image_size import NOMINAL_DISTANCE_M
 from gripmon.teach.matte import BLOCK_PX, blocks, grey_levels
-from gripmon.teach.silhouette import FEWEST_BACKGROUNDS, backgrounds_beside
+from gripmon.teach.silhouette import backgrounds_beside
 
 DEPTH_M = 0.115
 DISTANCE = (DEPTH_M, 5e-5)
@@ -185,19 +185,9 @@ def test_a_border_counts_where_different_backgrounds_show_it() -> None:
         ]
     )
     clear, different = backgrounds_beside(contrast, 1.0)
-    assert clear.tolist() == [4, 3, 0, 1, 4] and np.rint(different).tolist() == [1, 3, 0, 1, 4]
+    assert clear.tolist() == [4, 3, 0, 1, 4] and different.tolist() == [1, 3, 0, 1, 4]
     clear, different = backgrounds_beside(contrast, 3.0)
-    assert clear.tolist() == [4, 3, 0, 1, 3] and np.rint(different).tolist() == [1, 3, 0, 1, 3]
-
-
-@pytest.mark.parametrize("count", [5, 15, 50])
-def test_noise_makes_no_other_background_of_one_however_many_images_there_are(count: int) -> None:
-    """The range of n grey levels grows with n: of 50 images with 1.5 times the noise it is seven times the noise."""
-    rng = np.random.default_rng(count)
-    same = 40.0 + rng.normal(0.0, 3.0, (count, 4000))
-    assert np.mean(backgrounds_beside(same, 2.0)[1] >= FEWEST_BACKGROUNDS) < 0.03
-    fifth = np.arange(count)[:, None] < max(2, count // 4)
-    assert (backgrounds_beside(np.where(fifth, same + 50.0, same), 2.0)[1] >= FEWEST_BACKGROUNDS).all()
+    assert clear.tolist() == [4, 3, 0, 1, 3] and different.tolist() == [1, 3, 0, 1, 3]
 
 
 def test_fingers_are_told_apart_and_placed_in_space_by_their_perspective(box: tuple) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.teach.silhouette import FEWEST_BACKGROUNDS, FEWEST_CLEAR, Stations, Transitions
+from gripmon.teach.silhouette import FEWEST_CLEAR, Stations, Transitions
 from gripmon.teach.straight_pieces import Chain
 
 SHORTEST_BORDER_PX = 20
@@ -81,7 +81,7 @@ def borders_of(
             usual = int(np.median(clear[at]))
             out.append(Border(
                 f"the {name}'s {border}", int(np.count_nonzero(part)), float(1.0 - missed[part].mean()),
-                uv_px[part & missed], usual, len(own[0][1].worth), bool(np.median(different[at]) < FEWEST_BACKGROUNDS),
+                uv_px[part & missed], usual, len(own[0][1].worth), bool(np.median(different[at]) < 2.0),
                 bool(np.median(level[at]) < _DARK),
             ))  # fmt: skip
     return sorted(out, key=lambda border: border.share)

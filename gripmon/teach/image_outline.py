@@ -18,9 +18,8 @@ from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsE
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
-from gripmon.teach.outermost import Outside
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.straight_pieces import END_MARGIN_PX, Chain, fit_chains, runs, without_outliers
+from gripmon.teach.straight_pieces import Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""
@@ -208,10 +207,8 @@ def _without(matte: Matte, bad: Mapping[int, str]) -> Matte:
 
 
 def _length_px(chain: Chain) -> float:
-    """With what the blur of the next edge takes from a free end."""
     ends = chain.uv_px[np.array(chain.pieces)]
-    free_px = 0.0 if chain.closed else 2.0 * END_MARGIN_PX
-    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()) + free_px
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
 def _fingers(
@@ -225,16 +222,10 @@ def _fingers(
     """The fingers with the chains of their outlines, and how much of each border that is."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
-    along, near, outside = [], _near(parts.rest), Outside(matte.edges, matte.still)
+    along, near = [], _near(parts.rest)
     for part, contour in contours:
         stations = _stations(contour, part, near)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
-        beyond_px = outside.beyond_px(stations, found.offset_px)
-        found = replace(
-            found,
-            offset_px=found.offset_px + beyond_px,
-            usable=found.usable & outside.is_free(stations, found.offset_px + beyond_px, blur_px),
-        )
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
         along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))

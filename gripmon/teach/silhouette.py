@@ -37,13 +37,13 @@ FEWEST_CONTRASTS = 6.0
 """Least contrast over the noise (root of the sum of squares over images): less locates an edge to a sixth of its blur.
 """
 CLEAR_NOISES = 6.0
-"""Contrast over a pixel's noise, at least a grey level, from which an image alone shows the finger's border there."""
+"""Contrast over a pixel's noise, at least a grey level, from which an image alone shows the finger's border there; and
+grey levels of two backgrounds so far apart are different ones."""
 FEWEST_CLEAR = 4
 """Least number of images that show the border so: one of five may show something else there."""
-FEWEST_BACKGROUNDS = 1.5
-"""Least number of different backgrounds among these (:func:`backgrounds_beside`): two, one of them in a fifth of the
-images or more.  Beside a tone's border within a finger there is always the same; within a background the grey level on
-the finger's side changes, and the image isn't used there."""
+FEWEST_BACKGROUNDS = 2
+"""Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
+within a background the grey level on the finger's side changes, and the image isn't used there."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -82,7 +82,7 @@ class Transitions:
     worth: Array
     sharpness: Array
     clear: NDArray[np.intp]
-    different: Array
+    different: NDArray[np.intp]
     level: Array
 
 
@@ -165,19 +165,15 @@ def measure_transitions(
     d -= (light / usual)[:, :, None] * finger[None]
     sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
+    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
+    weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
     shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
-    # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.  Limited is what
-    # contrasts differ by: of a dark finger before bright backgrounds all would be the same.
-    count = np.maximum(sound.sum(axis=0), 1)
-    weight = contrast - shading * contrast.sum(axis=0) / count
-    weight = np.where(sound, weight / np.maximum(1.0, np.abs(weight) / 60.0), 0.0)
-    weight = np.where(sound, weight - shading * weight.sum(axis=0) / count, 0.0)
+    weight = weight - shading * weight.mean(axis=0)
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
-    usable &= total_lower > (FEWEST_CONTRASTS * noise) ** 2
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
     if blur_px is None:
@@ -196,22 +192,18 @@ def measure_transitions(
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
-def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], Array]:
-    """How many images (s,) show a clear contrast (n, s) at each station, and before how many different backgrounds,
-    (s,), 0 without an image.
-
-    Two images are as much of one background as ``exp(-z²/2)``, their contrasts half a clear contrast times z apart; the
-    inverse of its mean over all pairs is the number of backgrounds, each as often as the others, that are as different
-    (Leinster and Cobbold 2012, of order 2).  Noise alone gives 1.1, and 1.4 where it is twice what is thought,
-    however many images there are; one image in five before another background gives 1.5, two 1.9.
+def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """How many images (s,) show a clear contrast (n, s) at each station, and how many different backgrounds (s,) these
+    have: ranges of grey levels, as wide as a clear contrast is high, that hold some.
     """
     least = CLEAR_NOISES * max(noise, 1.0)
     clear = np.abs(contrast) > least
-    alike = np.zeros(contrast.shape[1])
-    for own, there in zip(contrast, clear, strict=True):
-        alike += np.where(clear & there, np.exp(-2.0 * np.square((contrast - own) / least)), 0.0).sum(axis=0)
-    count = np.count_nonzero(clear, axis=0)
-    return count, np.square(count) / np.maximum(alike, 1.0)
+    levels = np.sort(np.where(clear, contrast, np.inf), axis=0)
+    lowest = np.where(np.isfinite(levels[0]), levels[0], 0.0)
+    # Of many images the levels leave no gaps, so that their range is divided.
+    steps = np.floor((np.where(np.isfinite(levels), levels, lowest) - lowest) / least)
+    gaps = np.diff(steps, axis=0) > 0.0
+    return np.count_nonzero(clear, axis=0), np.count_nonzero(gaps, axis=0) + clear.any(axis=0)
 
 
 def _usual(finger: Array, within: NDArray[np.bool_]) -> Array:

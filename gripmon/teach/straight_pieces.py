@@ -37,15 +37,12 @@ WORST_SIGMA_PX = 1.0
 """Standard deviation of a piece's ends, from the scatter over the images, from which it is left out: search lines at
 work reach 3 px to either side."""
 LEAST_USABLE = 0.6
-"""Least part of a piece's stations that are measured, and lie on one line: what is between others is bridged, not the
-most of it."""
+"""Least part of a piece's stations that are measured: what lies between others is bridged, not the most of it."""
 LONGEST_CUT_PX = 24.0
 """Largest length of a piece that may be only the smoothed contour cutting a corner off; its two neighbours decide."""
 CORNER_BLUR_PX = 2.0
 """Distance from a corner within which the blur of its two edges mixes."""
 _GAP_PX = 12.0
-_MOST_APART_PX = 2.0 * WORST_RMS_PX
-"""Largest distance between two pieces of a curve at their joint, of which each is missed by half."""
 _OUTLIER_PX = 1.0
 _MOST_POINTS = 1500
 
@@ -164,10 +161,7 @@ def _scatter(p: Array) -> float:
 
 @dataclass(frozen=True)
 class _Line:
-    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points;
-    ``ends`` (2, 2), between which it is their line, as far as the next piece; ``shown`` (2, 2), the first and the
-    last of them.
-    """
+    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points."""
 
     normal: Array
     distance: float
@@ -175,8 +169,6 @@ class _Line:
     fold_distances: Array
     rms_px: float
     seen: float
-    ends: Array
-    shown: Array
 
 
 def fit_chains(
@@ -198,9 +190,6 @@ def fit_chains(
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
-        length_px = float(np.linalg.norm(ideal[last] - ideal[first]))
-        if last - first + 1 < LEAST_USABLE * length_px:
-            return None
         return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
 
     spans = list(itertools.pairwise(cuts))
@@ -217,12 +206,11 @@ def fit_chains(
             k += 1
 
     def joined(before: _Found, after: _Found) -> bool:
-        (_, one), (_, other) = before, after
-        ends = one.ends[1], other.ends[0]
-        gap_px = float(np.linalg.norm(ends[1] - ends[0]))
-        if gap_px <= _GAP_PX and _is_smooth(before, after, ideal):
-            return _apart_px(one, other, 0.5 * (ends[0] + ends[1])) <= _MOST_APART_PX
+        ends = ideal[before[0][1]], ideal[after[0][0]]
+        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX:
+            return True
         # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
+        (_, one), (_, other) = before, after
         distances = np.array([[one.distance], [other.distance]])
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
         return all(
@@ -315,7 +303,7 @@ def _goes_on(
         return False
     found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
     off = np.abs(found.offset_px[found.usable])
-    return len(off) >= max(1.0, LEAST_USABLE * len(found.usable)) and float(np.quantile(off, 0.9)) < within_px
+    return bool(len(off) and float(np.quantile(off, 0.9)) < within_px)
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
@@ -373,12 +361,6 @@ def _measured(
         way *= np.sign(way @ (ends[1] - ends[0]))
         foot = line[0] * line[1]
         ends = foot + float((ends[0] - foot) @ way) * way, foot + float((ends[1] - foot) @ way) * way
-    shown = at[list(_followed(inlier))]
-    shown = foot + ((shown - foot) @ way)[:, None] * way
-    margin = np.linalg.norm(at[[0, -1]] - ends, axis=1) + 0.5
-    reached = np.linalg.norm(shown - ends, axis=1) <= margin
-    if np.count_nonzero(inlier) < LEAST_USABLE * len(inlier):
-        return None
     residual = at[inlier] @ line[0] - line[1]
     if float(np.sqrt(np.square(residual).mean())) > WORST_RMS_PX:
         return None
@@ -388,23 +370,7 @@ def _measured(
     at_ends = jackknife_sigma(normals @ np.transpose(ends) - distances[:, None])
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
-    rms_px = float(np.sqrt(np.square(residual).mean()))
-    reach = np.where(reached[:, None], ends, shown)
-    return _Line(line[0], line[1], normals, distances, rms_px, float(inlier.mean()), reach, shown)
-
-
-def _followed(inlier: NDArray[np.bool_]) -> tuple[int, int]:
-    """The first and the last station between which a piece's stations (s,), a pixel apart, lie on its line: where the
-    shortest piece of them would be measured.
-    """
-    size = min(int(SHORTEST_PIECE_PX), len(inlier))
-    enough = np.convolve(inlier, np.ones(size), "valid") >= LEAST_USABLE * size
-    at = np.flatnonzero(inlier)
-    if enough.any():
-        begun = int(enough.argmax())
-        ended = len(inlier) - 1 - int(enough[::-1].argmax())
-        at = at[(at >= begun) & (at <= ended)]
-    return int(at[0]), int(at[-1])
+    return _Line(line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean()))
 
 
 def _stations_on(
@@ -452,16 +418,16 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     distances = np.stack([np.append(line.distance, line.fold_distances) for line in lines])
     vertices, corner = [], []
     if not closed:
-        vertices.append(_foot(normals[0], distances[0], lines[0].shown[0]))
+        vertices.append(_foot(normals[0], distances[0], ideal[spans[0][0]]))
         corner.append(False)
     for k in range(count if closed else count - 1):
         a, b = k, (k + 1) % count
-        joint = 0.5 * (lines[a].ends[1] + lines[b].ends[0])
+        joint = 0.5 * (ideal[spans[a][1]] + ideal[spans[b][0]])
+        shorter = min(float(np.linalg.norm(ideal[last] - ideal[first])) for first, last in (spans[a], spans[b]))
         met = _meet(normals[a], distances[a], normals[b], distances[b])
-        smooth = _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal)
-        if not smooth or _apart_px(lines[a], lines[b], joint) > _MOST_APART_PX:
+        if shorter * _turn(normals[a, 0], normals[b, 0]) / 8.0 > CORNER_SAG_PX:
             vertices.append(met)
-            corner.append(not smooth)
+            corner.append(True)
             continue
         # Pieces of a curve meet at their common point: the intersection of nearly parallel lines is uncertain.
         feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
@@ -469,7 +435,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
         corner.append(False)
     if not closed:
-        vertices.append(_foot(normals[-1], distances[-1], lines[-1].shown[1]))
+        vertices.append(_foot(normals[-1], distances[-1], ideal[spans[-1][1]]))
         corner.append(False)
     if closed:
         vertices, corner = vertices[-1:] + vertices[:-1], corner[-1:] + corner[:-1]
@@ -477,18 +443,6 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     uv = from_ideal_px(camera, stacked.reshape(-1, 2)).reshape(stacked.shape)
     rms = np.array([line.rms_px for line in lines])
     return Chain(uv[0], uv[1:], closed, np.array(corner), rms)
-
-
-def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
-    """Whether two pieces approximate a curve, instead of meeting in a corner."""
-    shorter_px = min(float(np.linalg.norm(ideal[last] - ideal[first])) for (first, last), _ in (before, after))
-    return shorter_px * _turn(before[1].normal, after[1].normal) / 8.0 <= CORNER_SAG_PX
-
-
-def _apart_px(one: _Line, other: _Line, at: Array) -> float:
-    """How far two lines are from each other at a place."""
-    feet = [line.normal * (float(line.normal @ at) - line.distance) for line in (one, other)]
-    return float(np.linalg.norm(feet[0] - feet[1]))
 
 
 def _turn(a: Array, b: Array) -> float:
