@@ -60,12 +60,13 @@ def frames_of(
         )
         last = answer
         right, wrong = np.array([0.05, 0.25, 0.70]), np.array([0.62, 0.36, 0.02])
-        out.append(Frame(seen, right[answer], wrong[answer], repeats, 0.95))
+        together = np.array([0.1 + 0.1 * answer.sum(), 0.6 - 0.1 * answer.sum()])  # unlike the products
+        out.append(Frame(seen, right[answer], wrong[answer], repeats, 0.95, together))
     return out
 
 
 def told(frame: Frame) -> Told:
-    return Told(np.log(frame.right), np.log(frame.wrong), frame.repeats, frame.memory)
+    return Told(np.log(frame.right), np.log(frame.wrong), frame.repeats, frame.memory, np.log(frame.together))
 
 
 @pytest.mark.parametrize(("seed", "count", "leaving"), [(1, 5, True), (2, 5, True), (3, 15, False)])
@@ -75,7 +76,7 @@ def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, 
     e, yes = np.eye(3, dtype=bool), float(leaving)
     doubts = [
         Doubt(e[0], Rates(0.05, 0.01, 0.1, 0.0, 0.5 * yes), np.zeros(2, bool), held=False),
-        Doubt(e[1] | e[2], Rates(0.1, 0.5, 0.0, 1.0 * yes), np.array([True, False])),
+        Doubt(e[1] | e[2], Rates(0.1, 0.5, 0.0, 1.0 * yes), np.array([True, seed == 2])),
     ]
     frames = frames_of(rng, 3, count)
     for t in range(1, count, 3):

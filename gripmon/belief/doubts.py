@@ -146,18 +146,20 @@ class Onsets:
 class Told(NamedTuple):
     """What the fingers' ends show: log likelihood of each finger's answer where its ends are ``right`` and ``wrong``
     (f,); ``repeats`` (f,): whether it is the answer of the frame before; ``memory``: probability that an answer is only
-    repeated.
+    repeated.  ``together`` (2,): the same of all fingers' answers where all are right, and all wrong, NaN where these
+    are independent: what lies over all ends answers for all.
     """
 
     right: Array
     wrong: Array
     repeats: Flags
     memory: float
+    together: Array
 
 
 def nothing_told(fingers: int) -> Told:
     """No witness."""
-    return Told(np.zeros(fingers), np.zeros(fingers), np.zeros(fingers, bool), 0.0)
+    return Told(np.zeros(fingers), np.zeros(fingers), np.zeros(fingers, bool), 0.0, np.full(2, np.nan))
 
 
 @compiled
@@ -184,16 +186,27 @@ def log_transition(before: int, after: int, chances: Chances) -> float:
 @compiled
 def log_told(before: int, after: int, table: Table, told: Told, first: bool) -> float:
     """Log likelihood of the witnesses.  An answer that repeats is little news while what it is about stays."""
-    total = 0.0
-    for f in range(len(table.ends)):
+    total, fingers = 0.0, len(table.ends)
+    rights, sames, repeats = 0, 0, 0
+    for f in range(fingers):
         bad, was = after & table.ends[f], before & table.ends[f]
         right, was_right = bad == 0 or bad & table.fooled != 0, was == 0 or was & table.fooled != 0
-        log = told.right[f] if right else told.wrong[f]
-        if not first and (bad != 0) == (was != 0) and right == was_right:
-            again = told.memory if told.repeats[f] else 0.0
-            log = math.log(again + (1.0 - told.memory) * math.exp(log))
-        total += log
+        same = not first and (bad != 0) == (was != 0) and right == was_right
+        rights, sames, repeats = rights + int(right), sames + int(same), repeats + int(told.repeats[f])
+        total += answered(told.right[f] if right else told.wrong[f], same, told.repeats[f], told.memory)
+    alike = rights in (0, fingers) and sames in (0, fingers)
+    if alike and not math.isnan(told.together[0]):
+        log = told.together[0] if rights else told.together[1]
+        total = answered(log, sames > 0, repeats == fingers, told.memory)
     return total
+
+
+@compiled
+def answered(log: float, same: bool, repeats: bool, memory: float) -> float:
+    """Log likelihood of an answer of log likelihood ``log`` if it were new, where what it is about may be the ``same``
+    as before.
+    """
+    return math.log((memory if repeats else 0.0) + (1.0 - memory) * math.exp(log)) if same else log
 
 
 def _bits(flags: Sequence[bool] | Flags) -> int:

@@ -37,8 +37,15 @@ TEXTURE_PX = 0.34 * math.sqrt(40.0)
 STILL_NOISES = 1.5
 """Difference of two pictures, in units of what their noise makes of it, up to which nothing has changed."""
 LIKE_STILL, MOST_LIKE = 0.999, 0.98
-RIGHT, WRONG = np.log([0.05, 0.25, 0.70]), np.log([0.62, 0.36, 0.02])
-"""Log probability of 0, 1 or 2 indications of a finger's end, where it is one and where it is something else."""
+RIGHT, WRONG = np.array([0.155, 0.276, 0.569]), np.array([0.812, 0.117, 0.071])
+"""How probable 0, 1 or 2 indications of a finger's end are where it is one and where it is something else, of one of
+several fingers in view.  These tables: 1,518 right fits and 524 that had slid (``tools/bench belief --witnesses``).
+"""
+LONE_RIGHT, LONE_WRONG = np.array([0.049, 0.121, 0.830]), np.array([0.687, 0.139, 0.174])
+"""The same of the only finger in view."""
+BOTH_RIGHT = np.array([[106.0, 37.5, 54.5], [37.5, 120.0, 194.0], [54.5, 194.0, 473.0]]) / 1271.0
+BOTH_WRONG = np.array([[290.0, 15.5, 3.0], [15.5, 17.0, 11.5], [3.0, 11.5, 13.0]]) / 380.0
+"""Of both of two fingers."""
 REPEATS = 0.95
 """Probability that an answer about ends only repeats that of the frame before, at 15 frames/s."""
 
@@ -115,9 +122,13 @@ class Shadow:
     def _told(self, ends: FingerEndsSeen) -> Told:
         """Of fingers whose ends are out of view, nothing."""
         answer = np.where(ends.might > 0, np.minimum(ends.seen, 2), -1)
-        right, wrong = (np.where(answer >= 0, logs[answer], 0.0) for logs in (RIGHT, WRONG))
+        asked, together = np.flatnonzero(answer >= 0), np.full(2, np.nan)
+        tables = (LONE_RIGHT, LONE_WRONG) if len(asked) == 1 else (RIGHT, WRONG)
+        right, wrong = (np.where(answer >= 0, np.log(of[answer]), 0.0) for of in tables)
+        if len(asked) == len(answer) == 2:
+            together = np.log([of[answer[0], answer[1]] for of in (BOTH_RIGHT, BOTH_WRONG)])
         repeats, self._answer = (answer == self._answer) & (answer >= 0), answer
-        return Told(right, wrong, repeats, REPEATS)
+        return Told(right, wrong, repeats, REPEATS, together)
 
     def _seen(self, frame: Frame, measurement: Measurement) -> Seen | None:
         """The frame's edges; None with too few of them."""

@@ -16,13 +16,16 @@ STILL = 0.99
 
 
 class Told(NamedTuple):
-    """A frame with the probability of each finger's answer where its ends are right and wrong."""
+    """A frame with the probability of each finger's answer where its ends are right and wrong, and of all of them
+    ``together`` (2,) where all are.
+    """
 
     seen: Seen
     right: Array
     wrong: Array
     repeats: Array
     memory: float
+    together: Array
 
 
 class Sum(NamedTuple):
@@ -80,17 +83,23 @@ def _chains(doubts: Sequence[Doubt], frames: Sequence[Told], dt_s: float, path: 
 
 
 def _witnesses(doubts: Sequence[Doubt], frames: Sequence[Told], path: Sequence[int]) -> float:
-    log = 0.0
-    for f in range(len(doubts[0].ends)):
-        states = []
-        for s in path:
-            about = [d for i, d in enumerate(doubts) if s >> i & 1 and d.ends[f]]
-            states.append((bool(about), not about or any(d.fooled for d in about)))
-        for t, frame in enumerate(frames):
-            p = float((frame.right if states[t][1] else frame.wrong)[f])
-            if t and states[t] == states[t - 1]:
-                p = frame.memory * bool(frame.repeats[f]) + (1.0 - frame.memory) * p
-            log += math.log(p)
+    log, fingers = 0.0, range(len(doubts[0].ends))
+    states = []  # of each frame and finger: whether it is doubted, and whether its answer is as if it weren't
+    for s in path:
+        about = [[d for i, d in enumerate(doubts) if s >> i & 1 and d.ends[f]] for f in fingers]
+        states.append([(bool(of), not of or any(d.fooled for d in of)) for of in about])
+    for t, frame in enumerate(frames):
+        kept = [t > 0 and states[t][f] == states[t - 1][f] for f in fingers]
+        as_right = {right for _, right in states[t]}
+        if len(as_right) == 1 and len(set(kept)) == 1:
+            of = [(float(frame.together[0 if as_right == {True} else 1]), kept[0], bool(frame.repeats.all()))]
+        else:
+            of = [
+                (float((frame.right if states[t][f][1] else frame.wrong)[f]), kept[f], bool(frame.repeats[f]))
+                for f in fingers
+            ]
+        for p, same, again in of:
+            log += math.log(frame.memory * again + (1.0 - frame.memory) * p if same else p)
     return log
 
 

@@ -287,4 +287,4 @@ class World:
             if first or state != self._answered[f] or self._rng.random() >= MEMORY:
                 self._answer[f] = self._rng.choice(3, p=RIGHT if right else WRONG)
             self._answered[f], repeats[f] = state, not first and before == self._answer[f]
-        return Told(np.log(RIGHT[self._answer]), np.log(WRONG[self._answer]), repeats, MEMORY)
+        return Told(np.log(RIGHT[self._answer]), np.log(WRONG[self._answer]), repeats, MEMORY, np.full(2, np.nan))
