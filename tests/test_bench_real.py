@@ -221,9 +221,9 @@ def test_simulated_stills_are_judged_once_untaught_and_once_taught(replayed):
     from benchmarks.real_figures import figures_of
 
     assert [(run.bound, run.taught) for run in replayed] == [
-        (bound, taught) for bound in ("reference", "absolute") for taught in (False, True)
+        (bound, taught) for bound in ("reference", "absolute", "belief") for taught in (False, True)
     ]
-    untaught, taught = replayed[2:]
+    untaught, taught = replayed[2:4]
     assert untaught.parts[0].names == tuple(f"{n}.png" for n in range(10))
     assert [part.names for part in taught.parts] == [
         tuple(f"{n}.png" for n in (1, 3, 5, 7, 9)),
@@ -236,7 +236,7 @@ def test_simulated_stills_are_judged_once_untaught_and_once_taught(replayed):
         assert found.valid == STILLS and not found.beyond and not found.alerts
         assert (found.scatter[:3] < 1e-4).all() and found.chi2_scatter < 3.0
         assert (found.least < WIDE).all() and (found.bound <= found.least).all()
-        assert np.isfinite(found.proposed).all()
+        assert np.isfinite(found.proposed).all() == (run.bound != "belief")  # of which check knows nothing
 
 
 def test_jaw_openings_follow_their_stills_which_are_a_second_apart(stills: Path, tmp_path: Path):

@@ -87,7 +87,7 @@ def test_it_is_taught_and_replayed_like_a_file_made_by_hand(made):
     assert (play_m, refused) == (1e-3, None)
     found = [(run, figures_of(run)) for run in runs]
     assert [(run.taught, run.bound) for run, _ in found] == [
-        (taught, bound) for bound in ("reference", "absolute") for taught in (False, True)
+        (taught, bound) for bound in ("reference", "absolute", "belief") for taught in (False, True)
     ]
     for _, figures in found:
         assert (figures.stills, figures.valid) == (STILLS - 2, STILLS - 2), figures.reasons

@@ -271,7 +271,8 @@ class _Meter(FingertipMeter):
     def followed(self, image: Image, placed: PlacedPose, jaw_opening_m: float, reported: bool) -> Expected:
         """The most promising pose among those that the corners set by hand allow."""
         self._prior = self._prior_reported if reported else self._prior_unreported
-        root = np.linalg.cholesky(placed.covariance)
+        variances, axes = np.linalg.eigh(placed.covariance)  # corners nearly on a line leave one that rounding takes
+        root = axes * np.sqrt(np.maximum(variances, 0.0))
         poses = [perturb(placed.cam_T_grip, root @ offset) for offset in _spread(_POSES_AROUND)]
         starts = [Expected(pose, jaw_opening_m, jaw_opening_m) for pose in poses if pose[2, 3] > 0.0]
         for zoom, kept in zip((ZOOMS[2], ZOOMS[1]), _POSES_KEPT, strict=True):
