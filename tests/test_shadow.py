@@ -127,20 +127,22 @@ def test_records_are_the_same_with_and_without() -> None:
 
 @pytest.mark.parametrize("scene", ["clutter", "bump", "bent_finger"])
 def test_its_motion_is_true_within_its_bound(scene: str) -> None:
-    """A mount that jumps, a finger that bends.  After the jump, along the fingers, it takes its time."""
+    """A mount that jumps, a finger that bends: where the gripper stands is known at once.  That what shows its ends
+    after a jump along the fingers isn't something else is not, so that the bound stays wide.
+    """
     frames, truths = frames_of(scene)
     reference = reference_of(nominal_cam_T_grip())
     monitor = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, shadow=True)
     assert monitor.shadow is not None
-    within = []
+    within, errors_m = [], []
     for frame, truth in zip(frames, truths, strict=True):
         monitor.process(frame)
         believed = monitor.shadow.newest
-        if believed is None:
-            within.append(False)
-            continue
+        assert believed is not None
         error = difference(nominal_cam_T_grip(), truth.cam_T_grip) - believed.motion
         assert np.linalg.norm(error[:3]) <= believed.bound.position_m
         assert np.linalg.norm(error[3:]) <= believed.bound.rotation_rad
+        errors_m.append(np.linalg.norm(error[:3]))
         within.append(believed.bound.position_m < 1e-3)
-    assert np.mean(within) > (0.7 if scene == "bump" else 0.9)
+    assert np.quantile(errors_m, 0.9) < 5e-5
+    assert np.mean(within) > (0.3 if scene == "bump" else 0.9)
