@@ -25,7 +25,6 @@ from gripmon.cli import main
 from gripmon.daemon.config import ConfigError, builtin_config, load_config, read_gripper
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.model.atomic import write_atomically
 from gripmon.model.geometry import to_record
 from gripmon.simulate.scenario import Sensor
 from gripmon.teach.api import to_yaml
@@ -436,31 +435,6 @@ def test_reading_gives_back_what_was_written(tmp_path_factory: pytest.TempPathFa
     path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
     path.write_text(to_yaml(model), encoding="utf-8")
     assert to_settings(read_yaml(path), TaughtModel) == model
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = tmp_path / "taught.yaml"
-    path.write_bytes(b"old")
-
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("gripmon.model.atomic.os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        write_atomically(path, b"new")
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-    monkeypatch.undo()
-    write_atomically(path, b"new")
-    assert path.read_bytes() == b"new" and list(tmp_path.iterdir()) == [path]
-    assert path.stat().st_mode & 0o777 == 0o644 & ~_mask(), "as any other file, not private"
-
-
-def _mask() -> int:
-    import os
-
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def test_the_gripper_files_digest_is_that_of_its_content():

@@ -54,6 +54,10 @@ class Bound(NamedTuple):
     absolute_m: float
     absolute_rad: float
 
+    def within(self, position_m: float, rotation_rad: float) -> bool:
+        """Whether the bound on the motion is no more than these."""
+        return self.position_m <= position_m and self.rotation_rad <= rotation_rad
+
 
 class Believed(NamedTuple):
     """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place, and their

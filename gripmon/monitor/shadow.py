@@ -7,7 +7,6 @@ is turned, with the pixels that stand beside it; the belief does the rest (:mod:
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -50,13 +49,6 @@ REPEATS = 0.95
 """Probability that an answer about ends only repeats that of the frame before, at 15 frames/s."""
 
 
-class _Beside(NamedTuple):
-    """Grey levels (e, 2, p) to both sides of the edges; NaN of those that weren't seen."""
-
-    grey: Array
-    noise: float
-
-
 class Shadow:
     """Of one monitor.  ``newest`` is what the belief says of the frame, None while none was measured."""
 
@@ -81,7 +73,7 @@ class Shadow:
             doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors,
             risk=settings.policy.integrity_risk, most=most, covariance=covariance,
         )  # fmt: skip
-        self._beside: _Beside | None = None
+        self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, when it was seen last
         self._last_s: float | None = None
         self._jaw_m: float | None = None
         self._answer = np.full(len(self._ends_of), -1)
@@ -138,7 +130,7 @@ class Shadow:
         searched, shown = np.zeros((edges, 2)), np.zeros(edges, bool)
         strength = np.full(edges, 1.0)
         assert isinstance(frame.image, np.ndarray)
-        beside = _beside(frame.image, measurement, edges)
+        beside, noise = _beside(frame.image, measurement, edges), c.noise / math.sqrt(3.0)  # of three pixels' mean
         at = self._columns(measurement)
         away = perturbation_between(self._ref_T, p.cam_T_grip)
         reported_m = self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
@@ -149,22 +141,23 @@ class Shadow:
             sample = c.sample[own]
             if len(np.unique(sample)) < FEWEST_POINTS or not fit.edge_seen[edge]:
                 continue
-            line = _line(p.layout.fraction[sample], 1.0 / np.square(c.sigma_px[own]))
+            fraction = p.layout.fraction[sample]
+            line = _line(fraction, 1.0 / np.square(c.sigma_px[own]))
             both = line @ np.column_stack([c.offset_px[own], from_reference[sample], at[sample]])
-            left = c.offset_px[own] - _basis(p.layout.fraction[sample]) @ both[:, 0]
+            left = c.offset_px[own] - _basis(fraction) @ both[:, 0]
             spread = float(left @ left) / (len(own) - 2)
             independent = max(float(p.independence[edge]) * len(own), 2.0)
             measured[edge], searched[edge], rows[edge] = both[:, 0] + both[:, 1], both[:, 1], both[:, 2:]
             white[edge] = LEAST_WHITE_PX**2 + spread * np.array([1.0, 3.0]) / independent
             step = float(np.median(np.abs(c.step[own])))
-            texture = _texture(beside.grey, int(edge), beside.noise)
+            texture = _texture(beside, int(edge), noise)
             strength[edge] = (TEXTURE_PX * texture / max(step, 1.0)) ** 2 / independent
             rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(np.median(c.step[own])), 0.0
             shown[edge] = True
         if np.count_nonzero(shown) < 3:
             return None
-        likeness = np.array([self._likeness(beside, e) if shown[e] else 0.0 for e in range(edges)])
-        self._remember(beside, shown)
+        likeness = np.array([_likeness(beside[e], self._beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
+        self._beside = np.where(shown[:, None, None], beside, self._beside)
         return Seen(rows, measured, white, shown, np.zeros(edges, np.int64), likeness, strength, searched)
 
     def _columns(self, measurement: Measurement) -> Array:
@@ -181,24 +174,6 @@ class Shadow:
         centre = np.array([camera.cx_px, camera.cy_px])
         out[:, FOCAL] = np.einsum("ni,ni->n", p.normal, p.uv_px - centre)
         return out
-
-    def _likeness(self, beside: _Beside, edge: int) -> float:
-        """How like the pixels beside an edge are to when it was seen last: of the side that changed more."""
-        if self._beside is None:
-            return 0.0
-        likes = []
-        for now, then in zip(beside.grey[edge], self._beside.grey[edge], strict=True):
-            if not np.isfinite(now).all() or not np.isfinite(then).all():
-                return 0.0
-            likes.append(_alike(now, then, beside.noise))
-        return min(likes)
-
-    def _remember(self, beside: _Beside, shown: Flags) -> None:
-        if self._beside is None:
-            self._beside = beside
-            return
-        grey = np.where(shown[:, None, None], beside.grey, self._beside.grey)
-        self._beside = _Beside(grey, beside.noise)
 
 
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
@@ -231,22 +206,28 @@ def _line(fraction: Array, weight: Array) -> Array:
     return np.asarray(np.linalg.solve(weighted @ basis, weighted))
 
 
-def _beside(image: Image, measurement: Measurement, edges: int) -> _Beside:
+def _beside(image: Image, measurement: Measurement, edges: int) -> Array:
+    """(e, 2, p) grey levels to both sides of the edges, each the mean of three pixels across; NaN of those out of
+    view.
+    """
     p = measurement.prediction
-    xi = measurement.consensus.xi
     grey = np.full((edges, 2, BESIDE_POINTS), np.nan)
-    moved = (p.jacobian @ xi)[:, None] * p.normal
+    moved = (p.jacobian @ measurement.consensus.xi)[:, None] * p.normal
     for edge in p.layout.edges:
         own = np.flatnonzero(p.layout.edge == edge)
         own = own[np.linspace(0, len(own) - 1, BESIDE_POINTS).astype(int)]
         for side, way in enumerate((-BESIDE_PX, BESIDE_PX)):
             uv = p.uv_px[own] + moved[own] + way * p.normal[own]
-            three = [uv + k * p.normal[own] for k in (-1.0, 0.0, 1.0)]
-            maps = np.array(three, np.float32)
-            grey[edge, side] = read_profiles(
-                image, np.ascontiguousarray(maps[None, :, :, 0]), np.ascontiguousarray(maps[None, :, :, 1])
-            ).mean(axis=0)
-    return _Beside(grey, measurement.candidates.noise / math.sqrt(3.0))
+            maps = np.array([uv + k * p.normal[own] for k in (-1.0, 0.0, 1.0)], np.float32)
+            grey[edge, side] = read_profiles(image, maps[..., 0], maps[..., 1]).mean(axis=0)
+    return grey
+
+
+def _likeness(now: Array, then: Array, noise: float) -> float:
+    """How like two pictures (2, p) of an edge's sides are, of the side that changed more; 0 where one wasn't seen."""
+    if not np.isfinite(now).all() or not np.isfinite(then).all():
+        return 0.0
+    return min(_alike(*sides, noise) for sides in zip(now, then, strict=True))
 
 
 def _texture(grey: Array, edge: int, noise: float) -> float:

@@ -90,7 +90,7 @@ def run(seed: int, setup: Setup) -> Run:
         for k, risk in enumerate(RISKS):
             bound = belief.bound(risk)
             beyond[k] += error_m > bound.position_m or error_rad > bound.rotation_rad
-            available[k] += bound.position_m <= ALERT_M and bound.rotation_rad <= ALERT_RAD
+            available[k] += bound.within(ALERT_M, ALERT_RAD)
         errors.append(error_m)
         bounds.append(belief.bound(1e-3).position_m)
         dropped.append(believed.dropped)

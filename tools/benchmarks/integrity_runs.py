@@ -290,7 +290,7 @@ def _believed(believed: Believed | None, look: Look, truth: Truth, limits: Alert
         out["level_m"] = out["reference_m"] = _short(bound.position_m)
         out["level_rad"] = out["reference_rad"] = _short(bound.rotation_rad)
         out["absolute_m"], out["absolute_rad"] = _short(bound.absolute_m), _short(bound.absolute_rad)
-        out["valid"] = bound.position_m <= limits.position_m and bound.rotation_rad <= limits.rotation_rad
+        out["valid"] = bound.within(limits.position_m, limits.rotation_rad)
     return out
 
 

@@ -260,7 +260,7 @@ def _believed(source: Iterable[Frame], config: gripmon.Config) -> Iterator[Still
             continue
         bound = believed.bound
         pose = to_record(perturb(from_record(monitor.reference.cam_T_grip), believed.motion))
-        valid = bound.position_m <= policy.alert_limit_m and bound.rotation_rad <= policy.alert_limit_rad
+        valid = bound.within(policy.alert_limit_m, policy.alert_limit_rad)
         yield Still(
             record.name, True, valid, pose.translation_m, pose.rotation_xyzw, tuple(shadow.covariance.ravel().tolist()),
             bound.position_m, bound.rotation_rad, "", None, (),
