@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import special, stats
 from support.belief_paths import Told as Frame
 from support.belief_paths import sum_of_paths
 
@@ -19,7 +19,9 @@ from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 DT_S = 1.0 / 15.0
-STEADY = replace(Priors(), creep_m_s=0.0, creep_rad_s=0.0, another=0.0, aligned=0.0)
+STEADY = replace(Priors(), creep_m_s=0.0, creep_rad_s=0.0, another=0.0, aligned=0.0, missed=0.0)
+SURE = replace(STEADY, reference=(5e-5,) * 3 + (1e-3,) * 3, opening_m=5e-5, length_m=5e-5)
+"""A reference that tells each edge's place to less than a pixel."""
 ALONG = np.array([0.0, 0.6, 0.8])
 
 
@@ -37,11 +39,12 @@ def rows_of(rng: np.random.Generator, edges: int) -> np.ndarray:
 
 
 def frames_of(
-    rng: np.random.Generator, edges: int, count: int, like: float | None = None, clean: bool = False
-) -> list[Frame]:
+    rng: np.random.Generator, edges: int, count: int, like: float | None = None, clean: bool = False,
+    priors: Priors = STEADY,
+) -> list[Frame]:  # fmt: skip
     """Frames with errors as modelled; unless ``clean``, edges are now and then a third of a pixel off."""
     rows = rows_of(rng, edges)
-    g = rng.normal(size=SIZE) * np.sqrt(np.diag(STEADY.covariance()))
+    g = rng.normal(size=SIZE) * np.sqrt(np.diag(priors.covariance()))
     g[MOTION] = g[LATELY] = 0.0
     lasting, back, out = rng.normal(0.0, 0.05, (edges, 2)), np.zeros((edges, 2)), []
     last = np.full(2, -1)
@@ -51,8 +54,8 @@ def frames_of(
         y = rows @ g + lasting + back + rng.normal(0.0, 0.02, (edges, 2))
         y += 0.0 if clean else (rng.random(edges) < 0.3)[:, None] * rng.normal(0.0, 0.3, (edges, 2))
         seen = Seen(
-            rows, y, np.full((edges, 2), 4e-4), np.ones(edges, bool), np.zeros(edges, np.int64), rho,
-            np.full(edges, 1e-2), rows @ g,
+            rows, y[:, None], np.full((edges, 1, 2), 4e-4), np.ones(edges, np.int64), np.ones(edges, bool),
+            np.zeros(edges, np.int64), rho, np.full(edges, 1e-2), rows @ g,
         )  # fmt: skip
         answer = rng.integers(0, 3, 2)
         repeats = (
@@ -78,16 +81,16 @@ def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, 
         Doubt(e[0], Rates(0.05, 0.01, 0.1, 0.0, 0.5 * yes), np.zeros(2, bool), held=False),
         Doubt(e[1] | e[2], Rates(0.1, 0.5, 0.0, 1.0 * yes), np.array([True, seed == 2])),
     ]
-    frames = frames_of(rng, 3, count)
+    frames = frames_of(rng, 3, count, priors=SURE)
     for t in range(1, count, 3):
-        frames[t].seen.shown[2] = False
+        frames[t].seen.found[2] = 0
     if leaving:
         paths = list(itertools.product(range(4), repeat=count))
     else:
         steps = range(count + 1)
         paths = [tuple((t >= a) * 1 | (t >= b) * 2 for t in range(count)) for a in steps for b in steps]
-    truth = sum_of_paths(doubts, STEADY, frames, DT_S, paths)
-    belief = Belief(doubts, ALONG, STEADY, everything=True)
+    truth = sum_of_paths(doubts, SURE, frames, DT_S, paths)
+    belief = Belief(doubts, ALONG, SURE, everything=True)
     for frame in frames:
         belief.update(frame.seen, DT_S, told(frame))
     for doubted, weight in truth.weights.items():
@@ -97,6 +100,43 @@ def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, 
     keep = [i for i in range(SIZE) if i not in range(6, 12)]  # p: not in the sum, which has no creep
     assert np.abs((mean - truth.mean) / sigma)[keep].max() < 1e-9
     assert np.abs((covariance - truth.covariance) / np.outer(sigma, sigma))[np.ix_(keep, keep)].max() < 1e-9
+
+
+def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_place() -> None:
+    """Four edges, another thing's that all lie near the gripper's own: as dense Gaussians have it, against far."""
+    frame = frames_of(np.random.default_rng(4), 4, 1)[0].seen
+    rates = Rates(0.3, 0.0)
+    doubts = [
+        Doubt(np.arange(4) < 2, rates, np.zeros(2, bool)), Doubt(np.arange(4) >= 2, rates, np.zeros(2, bool)),
+    ]  # fmt: skip
+    belief = Belief(doubts, ALONG, STEADY, everything=True)
+    belief.update(frame, DT_S)
+    rows, values = frame.rows.reshape(-1, SIZE), frame.lines[:, 0].ravel()
+    assert (np.einsum("qi,ij,qj->q", rows, STEADY.covariance(), rows)[::2] > 1.0).all()
+    noise = STEADY.lasting_px**2 + 1e-2 + 4e-4
+
+    def log_of(bad: np.ndarray) -> float:
+        """Of the rows that are another thing's (8,): all near, or all far, each kind by half."""
+
+        def normal(at: np.ndarray, extra: float, of: np.ndarray) -> float:
+            covariance = rows[of] @ STEADY.covariance() @ rows[of].T + np.diag((noise + extra * at)[of])
+            return float(stats.multivariate_normal(np.zeros(len(covariance)), covariance).logpdf(values[of]))
+
+        if not bad.any():
+            return normal(bad, 0.0, ~bad)
+        away = values[bad] - frame.searched.ravel()[bad]
+        far = stats.norm(0.0, np.sqrt(STEADY.far_px**2 + 1e-2 + 4e-4)).logpdf(away).sum()
+        own = 0.0 if bad.all() else normal(bad, 0.0, ~bad)
+        both = np.logaddexp(normal(bad, STEADY.near_px**2, np.ones(8, bool)), own + far)
+        return float(both - 0.5 * bad.sum() * np.log(2.0))
+
+    logs = {}
+    for doubted in range(4):
+        bad = np.repeat([doubted & 1, doubted & 1, doubted >> 1, doubted >> 1], 2).astype(bool)
+        logs[doubted] = log_of(bad) + np.log([0.7, 0.3])[[doubted & 1, doubted >> 1]].sum()
+    total = np.logaddexp.reduce(list(logs.values()))
+    for doubted, log in logs.items():
+        assert np.log(belief.weights[doubted]) == pytest.approx(log - total, abs=1e-7)
 
 
 def test_the_order_of_edges_says_nothing() -> None:
@@ -128,7 +168,7 @@ def test_two_pictures_in_turn_tell_what_two_pictures_tell() -> None:
         rng = np.random.default_rng(3)
         belief = Belief(never(8), ALONG, STEADY, everything=True, backgrounds=backgrounds)
         for t, frame in enumerate(frames_of(rng, 8, count, 0.0)):
-            seen = frame.seen._replace(white=np.full((8, 2), white_px**2))
+            seen = frame.seen._replace(white=np.full((8, 1, 2), white_px**2))
             seen.background[:] = t % 2 % backgrounds
             seen.likeness[:] = 0.99999 if t >= 2 and backgrounds > 1 else 0.0
             belief.update(seen, DT_S)
@@ -152,7 +192,7 @@ def test_a_creeping_mount_before_a_still_picture_is_as_sure_as_the_full_filter_s
         for t, frame in enumerate(frames):
             step = np.repeat([priors.creep_m_s, priors.creep_rad_s], 3) * np.sqrt(DT_S)
             d = d + (rng.normal(size=6) * step if t else 0.0)
-            frame.seen.measured[:] += frame.seen.rows[:, :, MOTION] @ d
+            frame.seen.lines[:, 0] += frame.seen.rows[:, :, MOTION] @ d
             belief.update(frame.seen, DT_S)
         mean, covariance = belief.moments
         full = full_filter(priors, frames)
@@ -201,7 +241,7 @@ def test_odds_for_the_wrong_side_are_as_rare_as_they_say(like: float) -> None:
                 if t:
                     place = stays * place + np.sqrt(1.0 - stays**2) * rng.normal(0.0, size, 2)
                     back = like * back + np.sqrt(1.0 - like**2) * rng.normal(0.0, 0.1, 2)
-                frame.seen.measured[0] = frames[0].seen.searched[0] + place + back + rng.normal(0.0, 0.02, 2)
+                frame.seen.lines[0, 0] = frames[0].seen.searched[0] + place + back + rng.normal(0.0, 0.02, 2)
         doubt = Doubt(np.arange(6) == 0, Rates(0.5, 0.0), np.zeros(2, bool), held=False)
         belief, lied = Belief([doubt], ALONG, STEADY, everything=True), False
         for frame in frames:
@@ -217,7 +257,7 @@ def test_an_edge_that_lies_still_beside_its_place_speaks_once() -> None:
     doubt = Doubt(np.arange(8) == 0, Rates(0.5, 0.0), np.zeros(2, bool), held=False)
     belief, odds = Belief([doubt], ALONG, STEADY, everything=True), []
     for frame in frames:
-        frame.seen.measured[0] += [0.5, 0.0]
+        frame.seen.lines[0, 0] += [0.5, 0.0]
         belief.update(frame.seen, DT_S)
         odds.append(np.log(belief.weights[1] / belief.weights[0]))
     assert odds[0] > 0.0
@@ -244,7 +284,7 @@ def test_what_nothing_explains_gives_no_bound() -> None:
     belief = Belief(never(8), ALONG, STEADY)
     for t, frame in enumerate(frames):
         if 4 <= t < 6:
-            frame.seen.measured[:] += np.random.default_rng(t).normal(0.0, 5.0, (8, 2))
+            frame.seen.lines[:, 0] += np.random.default_rng(t).normal(0.0, 5.0, (8, 2))
         believed = belief.update(frame.seen, DT_S)
         if t in (4, 5):
             assert not believed.known
@@ -280,7 +320,7 @@ def test_an_edge_that_becomes_foreign_is_found_by_the_search_alone(searching: bo
     rates = Rates(0.0, 1e-3, 5e-3, 0.0, 0.7)  # never at first: only the search can find it later
     doubts = [Doubt(np.arange(8) == e, rates, np.zeros(2, bool), held=False) for e in range(8)]
     belief = Belief(doubts, ALONG, STEADY, searching=searching)
-    frames[-1].seen.measured[0] += [3.0, 0.0]
+    frames[-1].seen.lines[0, 0] += [3.0, 0.0]
     believed = [belief.update(frame.seen, DT_S) for frame in frames]
     assert [each.known for each in believed] == [True] * 6 + [searching]
     if searching:

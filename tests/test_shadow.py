@@ -55,7 +55,7 @@ def test_rows_say_what_a_moved_gripper_does_to_the_picture(xi: np.ndarray) -> No
     before, after = (seen_in(*_at(nominal_cam_T_grip(), step)) for step in (-xi, xi))
     both = before.shown & after.shown
     assert both.sum() >= 8
-    shift = after.measured[both] - before.measured[both]
+    shift = after.lines[both, 0] - before.lines[both, 0]
     assert np.abs(shift).max() > 0.3
     assert shift == pytest.approx(before.rows[both][:, :, MOTION] @ (2.0 * xi), abs=0.08)
     assert np.array_equal(before.rows[:, :, MOTION], before.rows[:, :, REFERENCE])
@@ -79,7 +79,7 @@ def test_a_longer_lens_and_brighter_light_move_edges_as_their_columns_say() -> N
     spread = seen_in(cv2.dilate(image, np.ones((3, 3), np.uint8)), pose, opening_m)
     for other, column, by in ((longer, FOCAL, np.log(grown)), (spread, LIGHT, 1.0)):
         both = plain.shown & other.shown
-        shift = other.measured[both, 0] - plain.measured[both, 0]
+        shift = other.lines[both, 0, 0] - plain.lines[both, 0, 0]
         wanted = by * plain.rows[both, 0, column]
         assert np.abs(wanted).max() > 0.5
         assert shift == pytest.approx(wanted, abs=0.08 if column == FOCAL else 0.45)  # a square spreads more

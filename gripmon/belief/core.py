@@ -136,7 +136,7 @@ class Belief:
         self._jumps = Jumps.of(self.priors, along)
         self._edges, self._fingers = len(doubts[0].edges), len(doubts[0].ends)
         p = self.priors
-        self._sizes = np.array([p.near_px**2, p.far_px**2, p.another, p.aligned])
+        self._sizes = np.array([p.near_px**2, p.far_px**2, p.another, p.aligned, p.missed, p.across_m**2])
         self._everything, self._searching = everything, searching
         kept = _MOST_CANDIDATES if everything else most + 1
         listed = kept if everything else kept + _MOST_LISTED
@@ -147,7 +147,7 @@ class Belief:
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._began = np.zeros(1, bool)  # of each hypothesis: all ends are doubted since the last frame
+        self._blind, self._began = np.zeros(1, bool), np.zeros(1, bool)  # hypotheses that trust no end, and since now
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
     @property
@@ -186,7 +186,7 @@ class Belief:
         for h in range(self._hypotheses):
             fade(self._bank, h, seen)
         told = told or nothing_told(self._fingers)
-        asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first)
+        asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first, self.priors.near_px**2)
         n = self._branch(asked, dt_s, hidden_knock)
         surprise = float(self._candidates.surprise[int(np.argmax(self._candidates.log_weight[:n]))])
         # A bound on the tail of chi-squared (Laurent and Massart 2000, lemma 1).
@@ -241,7 +241,7 @@ class Belief:
         best = float(candidates.log_weight[:n].max())
         i = self._hypotheses
         for h in range(self._hypotheses):
-            hope = max(float(candidates.surprise[h]), 0.0)
+            hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
             due = hidden_knock + (self.priors.unseen_knock if self._began[h] else 0.0)
             for j in range(len(jumps.share)):
                 chance = jumps.share[j] * (1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s))
@@ -267,7 +267,9 @@ class Belief:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates
         most, least = (min(n, len(bank.doubts)), 0.0) if self._everything else (self.most, self.least)
         merging = not self._everything
-        chosen, listed, dropped = keep(candidates, n, nodes, bank, other, asked.seen, self._table, most, least, merging)
+        chosen, listed, dropped = keep(
+            candidates, n, nodes, bank, other, asked.seen, self._table, asked.near, most, least, merging
+        )
         parents = nodes.parent[candidates.node[chosen]]
         for old, new in zip(bank[4:], other[4:], strict=True):
             new[: len(chosen)] = old[parents]
@@ -275,10 +277,17 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        unseen, before = (of & self._table.all_ends != 0 for of in (other.doubts[: len(chosen)], bank.doubts[parents]))
-        self._began = unseen & ~before
+        self._hide(other.doubts[: len(chosen)], parents, asked.seen)
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
         return float(dropped)
+
+    def _hide(self, doubts: Ints, parents: Ints, seen: Seen) -> None:
+        """Which hypotheses, of sets of ``doubts`` (h,), trust no end that is shown, and which of them since now; of
+        frames that show none, who sees them says so.
+        """
+        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(seen.shown))
+        blind = np.array([shown & ~edges_of(int(of), self._table.edges) == 0 for of in doubts], bool)
+        self._blind, self._began = blind, blind & ~self._blind[parents] & (shown != 0)
 
     def _not_known(self) -> None:
         """Beside what explains nothing: the pose is anywhere a knock may have brought it."""
@@ -293,7 +302,7 @@ class Belief:
         bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
         bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
         self._hypotheses = self._listed = n + 1
-        self._began = np.append(self._began[:n], False)
+        self._began, self._blind = np.append(self._began[:n], False), np.append(self._blind[:n], self._blind[h])
 
     def _believed(self, dropped: float, surprise: float) -> Believed:
         bank, n, mean = self._bank, self._listed, np.empty(SIZE)

@@ -75,15 +75,15 @@ def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
 
 
 class Table(NamedTuple):
-    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled``
-    and ``all_ends`` as bits of doubts.  ``rates`` (d, 5) in the order of :class:`Rates`.
+    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held`` and ``fooled``
+    as bits of doubts, ``at_ends`` as bits of edges.  ``rates`` (d, 5) in the order of :class:`Rates`.
     """
 
     edges: Ints
     ends: Ints
     held: int
     fooled: int
-    all_ends: int
+    at_ends: int
     rates: Array
 
     @classmethod
@@ -92,11 +92,11 @@ class Table(NamedTuple):
         if max(len(doubts), len(doubts[0].edges)) > MOST_DOUBTS:
             raise ValueError(f"{len(doubts)} doubts about {len(doubts[0].edges)} edges; at most {MOST_DOUBTS} of each")
         ends = np.array([_bits([d.ends[f] for d in doubts]) for f in range(len(doubts[0].ends))], np.int64)
-        every = [bool(d.ends.any() and d.ends.all()) for d in doubts]
+        at_ends = np.any([d.edges for d in doubts if d.ends.any()] or [np.zeros(len(doubts[0].edges), bool)], axis=0)
         rates = np.array([astuple(d.rates) for d in doubts])
         return cls(
             np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
-            _bits([d.fooled for d in doubts]), _bits(every), rates,
+            _bits([d.fooled for d in doubts]), _bits(at_ends), rates,
         )  # fmt: skip
 
 

@@ -21,10 +21,12 @@ the risk.
 
 
 @compiled
-def posterior(nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, mean: Array, covariance: Array) -> None:
+def posterior(
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, near: float, mean: Array, covariance: Array
+) -> None:  # fmt: skip
     """``mean`` (23,), which is that before the frame, and ``covariance`` (23, 23) of g after it."""
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
-    weigh(nodes, i, seen, doubted, held, root, solution)
+    weigh(nodes, i, seen, doubted, held, near, root, solution)
     half = np.empty((SIZE, SIZE))  # row j: root of M^-1 L', so that the covariance is half half'
     for j in range(SIZE):
         for k in range(SIZE):
@@ -71,8 +73,8 @@ def same_doubts(one: int, other: int, table: Table) -> bool:
 
 @compiled
 def keep(
-    candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, most: int,
-    least: float, merging: bool,
+    candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, near: float,
+    most: int, least: float, merging: bool,
 ) -> tuple[Ints, int, float]:  # fmt: skip
     """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, none lighter than ``least``, by
     moments where two are the same (``merging``).  At most ``most`` go on: beyond these what says the same of the place
@@ -96,7 +98,7 @@ def keep(
         for j in range(SIZE):
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-        posterior(nodes, i, seen, doubted, held, mean, covariance)
+        posterior(nodes, i, seen, doubted, held, near, mean, covariance)
         twin = -1
         for q in range(listed if merging else 0):
             if listed < most and not same_doubts(into.doubts[q], doubts, table):
@@ -147,14 +149,16 @@ def remember(
     """
     for q in range(len(chosen)):
         c = chosen[q]
-        h, jump = nodes.parent[candidates.node[c]], nodes.jump[candidates.node[c]]
+        i = candidates.node[c]
+        h, jump = nodes.parent[i], nodes.jump[i]
         if jump >= 0:
             add_noise(into, q, bank.mean[h], bank.covariance[h].copy(), factors[jump, : ranks[jump]])
         doubts = candidates.doubts[c]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
         before = edges_of(bank.doubts[h], table.edges)
-        for edge in range(len(seen.shown)):
+        for edge in range(len(seen.found)):
             if (doubted >> edge) & 1:
-                foreign(into, q, seen, edge, (before >> edge) & 1 == 0, (held >> edge) & 1 == 1, sizes, True)
-            elif seen.shown[edge]:
-                learn(into, q, seen, edge)
+                fresh, stays = (before >> edge) & 1 == 0, (held >> edge) & 1 == 1
+                foreign(into, q, seen, edge, fresh, stays, sizes, nodes.at[i, edge], nodes.wide[i, edge], True, True)
+            elif seen.found[edge] > 0 and nodes.line[i, edge] >= 0:
+                learn(into, q, seen, edge, nodes.line[i, edge])

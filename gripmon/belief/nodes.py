@@ -16,20 +16,27 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief.doubts import Table
-from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, root_of, shift_row
-from gripmon.belief.state import LENGTHS, SIZE, Bank, Ints, Seen
+from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, normal, root_of, shift_row
+from gripmon.belief.state import LENGTHS, SIZE, Bank, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
 _FIRST = LENGTHS.start
+APART_PX = 1.0
+"""Standard deviation of an edge's place beyond which it doesn't tell lines apart that lie two widths of an edge apart.
+"""
 
 
 class Nodes(NamedTuple):
     """n nodes: a hypothesis (``parent`` (n,)) that jumped (``jump`` (n,), -1 for none) before the frame, with log
-    weight ``before`` (n,).  ``root`` L (n, 23, 23); whitened ``rows`` w (n, e, 2, 23) and ``missing`` zeta (n, e, 2);
-    ``base`` (n, e), what of an edge's log likelihood depends on no set; ``free`` and ``held`` (n, e), its log
-    likelihood as another thing's; ``across`` (n, d), by how much that of each doubt's edges together is larger since a
-    straight thing may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown.
+    weight ``before`` (n,).  ``root`` L (n, 23, 23); whitened ``rows`` w (n, e, 2, 23) and ``missing`` zeta (n, e, 2)
+    with variance ``noise`` (n, e, 2) before; ``line`` (n, e), which of the lines there an edge is taken for, -1 for
+    none of them; where it is expected, ``at`` (n, e, 2), px, with variance ``wide`` (n, e, 2); ``base`` (n, e), what of
+    its log likelihood depends on no set; ``free`` and ``held`` (n, e), its log likelihood as another thing's.  Of edges
+    that are ``joint`` (n, e), another thing that lies near is wherever the gripper is by the others: these have ``far``
+    (n, e) instead.  ``across`` (n, d), by how much that of each doubt's edges together is larger since a straight thing
+    may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown; ``hope`` (n,),
+    by how much more a place would explain where all edges were on lines, of those that are on none.
     """
 
     parent: Ints
@@ -38,12 +45,19 @@ class Nodes(NamedTuple):
     root: Array
     rows: Array
     missing: Array
+    noise: Array
+    line: Ints
+    at: Array
+    wide: Array
     base: Array
     free: Array
     held: Array
+    joint: Flags
+    far: Array
     across: Array
     information: Array
     pull: Array
+    hope: Array
 
     @classmethod
     def empty(cls, nodes: int, edges: int, doubts: int) -> Nodes:
@@ -51,8 +65,10 @@ class Nodes(NamedTuple):
         n, e = nodes, edges
         return cls(
             np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros((n, SIZE, SIZE)),
-            np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
-            np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)), np.zeros((n, SIZE)),
+            np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e), np.int64),
+            np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
+            np.zeros((n, e), bool), np.zeros((n, e)), np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)),
+            np.zeros((n, SIZE)), np.zeros(n),
         )  # fmt: skip
 
 
@@ -69,54 +85,104 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
     else:
         root_of(covariance, root)
     information, pull = nodes.information[i], nodes.pull[i]
-    for j in range(SIZE):
-        pull[j] = 0.0
-        for k in range(SIZE):
-            information[j, k] = 0.0
-    for edge in range(len(seen.shown)):
+    information[:, :] = 0.0
+    pull[:] = 0.0
+    nodes.hope[i] = 0.0
+    prior, noise, expected = np.empty(2), np.empty(2), np.empty(2)
+    for edge in range(len(seen.found)):
+        for row in range(2):
+            nodes.at[i, edge, row], nodes.wide[i, edge, row] = seen.searched[edge, row], 0.0
+        nodes.joint[i, edge] = False
         nodes.base[i, edge] = nodes.free[i, edge] = nodes.held[i, edge] = 0.0
-        if not seen.shown[edge]:
+        if seen.found[edge] == 0:
             continue
-        fresh = (doubted >> edge) & 1 == 0
-        nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, False)
-        nodes.held[i, edge] = nodes.free[i, edge]
-        if not fresh:
-            nodes.held[i, edge] = foreign(bank, h, seen, edge, fresh, True, sizes, False)
         s = 1 + seen.background[edge]
         for row in range(2):
             q = 2 * edge + row
             offset, slope, spread = bank.offset[h, q], bank.slope[h, q], bank.spread[h, q]
-            variance = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s] + seen.white[edge, row]
-            innovation = seen.measured[edge, row] - offset[0] - offset[s]
+            noise[row] = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s]
+            expected[row] = offset[0] + offset[s]
             for j in range(SIZE):
                 line[j] = slope[0, j] + slope[s, j]
             if r:
-                innovation -= shift_row(mean, factor, gain, line, along)
+                expected[row] += shift_row(mean, factor, gain, line, along)
                 for j in range(r):
                     for k in range(r):
-                        variance += along[j] * between[j, k] * along[k]
+                        noise[row] += along[j] * between[j, k] * along[k]
             for j in range(SIZE):
                 line[j] += seen.rows[edge, row, j]
-                innovation -= line[j] * mean[j]
-            scale = 1.0 / math.sqrt(variance)
-            white = nodes.rows[i, edge, row]
+                expected[row] += line[j] * mean[j]
+            white, prior[row] = nodes.rows[i, edge, row], 0.0
             for j in range(SIZE):
                 total = 0.0
                 for k in range(j, SIZE):
                     total += root[k, j] * line[k]
-                white[j] = total * scale
-            zeta = innovation * scale
-            nodes.missing[i, edge, row] = zeta
+                white[j] = total
+                prior[row] += total * total
+            nodes.at[i, edge, row], nodes.wide[i, edge, row] = expected[row], prior[row] + noise[row]
+        of, share = which(seen, edge, nodes.at[i, edge], nodes.wide[i, edge], sizes)
+        nodes.line[i, edge], nodes.base[i, edge] = of, share
+        for row in range(2):
+            white = nodes.rows[i, edge, row]
+            if of < 0:
+                white[:] = 0.0
+                nodes.missing[i, edge, row] = 0.0
+                nodes.hope[i] -= 0.5 * math.log(2.0 * math.pi * (noise[row] + seen.white[edge, 0, row]))
+                continue
+            variance = noise[row] + seen.white[edge, of, row]
+            scale = 1.0 / math.sqrt(variance)
+            for j in range(SIZE):
+                white[j] *= scale
+            zeta = (seen.lines[edge, of, row] - expected[row]) * scale
+            nodes.missing[i, edge, row], nodes.noise[i, edge, row] = zeta, variance
             nodes.base[i, edge] -= 0.5 * math.log(2.0 * math.pi * variance)
             add_row(information, pull, white, zeta, 1.0)
+        if of < 0:
+            nodes.hope[i] -= share
+        fresh, at, wide = (doubted >> edge) & 1 == 0, nodes.at[i, edge], nodes.wide[i, edge]
+        apart = wide[0] > APART_PX**2 and seen.fitted[edge]  # then the fit says where its own would be
+        if apart:
+            at[:], wide[:] = seen.searched[edge], 0.0
+        nodes.joint[i, edge] = fresh and apart
+        nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
+        nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, True, False)
+        nodes.held[i, edge] = nodes.free[i, edge]
+        if not fresh:
+            nodes.held[i, edge] = foreign(bank, h, seen, edge, fresh, True, sizes, at, wide, True, False)
+
+
+@compiled
+def which(seen: Seen, edge: int, at: Array, wide: Array, sizes: Array) -> tuple[int, float]:
+    """The line there that an edge of the gripper is taken for, expected ``at`` (2,) with variance ``wide`` (2,), and
+    the log probability of that; or that of its being none of them, with what these say as anything's.
+
+    Where it is known to less than lines lie apart, the fit chooses, as for all edges together.
+    """
+    count, far, missed = seen.found[edge], sizes[1], sizes[4]
+    log, any_of, best, most = -math.log(count), 0.0, -1, -math.inf
+    for of in range(count):
+        near, anything = 0.0, 0.0
+        for row in range(2):
+            value, white = seen.lines[edge, of, row], seen.white[edge, of, row]
+            near += normal(value - at[row], wide[row] + white)
+            anything += normal(value - seen.searched[edge, row], far + white)
+        any_of += math.exp(anything) / count
+        if near > most:
+            best, most = of, near
+    none = math.log(missed) + math.log(any_of) if missed > 0.0 else -math.inf
+    if wide[0] > APART_PX**2 and seen.fitted[edge]:
+        return 0, math.log(1.0 - missed) + log
+    if missed > 0.0 and (wide[0] > APART_PX**2 or math.log(1.0 - missed) + log + most < none):
+        return -1, none
+    return best, math.log(1.0 - missed) + log
 
 
 @compiled
 def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes: Array) -> None:
     """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
-    fingers were longer or shorter by one length, far or near, each but for an edge's width.
+    fingers were longer or shorter by one length, each but for an edge's width.
     """
-    near, far, another, share = sizes[0], sizes[1], sizes[2], sizes[3]
+    near, another, share, across = sizes[0], sizes[2], sizes[3], sizes[5]
     before = bank.doubts[nodes.parent[i]]
     for k in range(len(table.edges)):
         nodes.across[i, k] = 0.0
@@ -125,28 +191,22 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
             of_ends = of_ends or (table.ends[finger] >> k) & 1 == 1
         if not of_ends:
             continue
-        log, apart, squares, cross, along, rows = 0.0, 0.0, 0.0, 0.0, 0.0, 0
-        most = 0.0
-        for edge in range(len(seen.shown)):
-            if (table.edges[k] >> edge) & 1 and seen.shown[edge]:
-                for row in range(2):
-                    most = max(most, abs(seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]))
-        for edge in range(len(seen.shown)):
-            if not ((table.edges[k] >> edge) & 1 and seen.shown[edge]):
+        log, apart, cross, along, rows = 0.0, 0.0, 0.0, 0.0, 0
+        for edge in range(len(seen.found)):
+            if not ((table.edges[k] >> edge) & 1 and seen.found[edge] > 0):
                 continue
             apart += nodes.held[i, edge]
             for row in range(2):
-                way = (seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]) / most
-                missing = seen.measured[edge, row] - seen.searched[edge, row]
-                variance = near + seen.strength[edge] + seen.white[edge, row]
-                log -= 0.5 * math.log(2.0 * math.pi * variance)
-                squares += missing * missing / variance
+                way = seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]
+                missing = seen.lines[edge, 0, row] - nodes.at[i, edge, row]
+                variance = near + nodes.wide[i, edge, row] + seen.strength[edge] + seen.white[edge, 0, row]
+                log += normal(missing, variance)
                 cross += way * missing / variance
                 along += way * way / variance
                 rows += 1
-        if rows < 4 or most == 0.0:
+        if rows < 4 or along == 0.0:
             continue
-        log -= 0.5 * (squares - far * cross * cross / (1.0 + far * along)) + 0.5 * math.log(1.0 + far * along)
+        log += 0.5 * (across * cross * cross / (1.0 + across * along) - math.log(1.0 + across * along))
         share_now = share if (before >> k) & 1 == 0 else another * share
         if share_now > 0.0:
             nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + log - apart)
@@ -174,11 +234,11 @@ def add_row(information: Array, pull: Array, white: Array, zeta: float, sign: fl
 
 @compiled
 def weigh(
-    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, root: Array, solution: Array
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, near: float, root: Array, solution: Array
 ) -> tuple[float, float]:
-    """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper; and the
-    surprise: by how much the squares of its own rows exceed what is expected, halved.  ``root`` (23, 23) of M and
-    ``solution`` (23,) M^-1 b are left behind.
+    """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper and others may
+    lie ``near`` (a variance, px^2); and the surprise: by how much the squares of its own rows exceed what is expected,
+    halved.  ``root`` (23, 23) of M and ``solution`` (23,) M^-1 b are left behind.
     """
     information, pull = np.empty((SIZE, SIZE)), np.empty(SIZE)
     for j in range(SIZE):
@@ -186,26 +246,63 @@ def weigh(
         for k in range(j + 1):
             information[j, k] = nodes.information[i, j, k]
         information[j, j] += 1.0
-    total, squares, own = 0.0, 0.0, 0
-    for edge in range(len(seen.shown)):
-        if not seen.shown[edge]:
+    total, far, squares, own, joint = 0.0, 0.0, 0.0, 0, False
+    for edge in range(len(seen.found)):
+        if seen.found[edge] == 0:
             continue
         if (doubted >> edge) & 1:
-            total += nodes.held[i, edge] if (held >> edge) & 1 else nodes.free[i, edge]
+            if nodes.joint[i, edge]:
+                joint, far = True, far + nodes.far[i, edge]
+            else:
+                total += nodes.held[i, edge] if (held >> edge) & 1 else nodes.free[i, edge]
             for row in range(2):
                 add_row(information, pull, nodes.rows[i, edge, row], nodes.missing[i, edge, row], -1.0)
         else:
             total += nodes.base[i, edge]
+            if nodes.line[i, edge] < 0:
+                continue
             squares += nodes.missing[i, edge, 0] ** 2 + nodes.missing[i, edge, 1] ** 2
             own += 2
     half = root_of(information, root)
-    for j in range(SIZE):
-        solution[j] = pull[j]
+    solution[:] = pull
     forward(root, solution)
+    explained = 0.0
     for j in range(SIZE):
-        squares -= solution[j] * solution[j]
+        explained += solution[j] * solution[j]
+    if joint:
+        total += log_sum(far, beside(nodes, i, seen, doubted, near, information, pull) + half - 0.5 * explained)
     backward(root, solution)
+    squares -= explained
     return total - 0.5 * squares - half, 0.5 * (squares - own)
+
+
+@compiled
+def beside(
+    nodes: Nodes, i: int, seen: Seen, doubted: int, near: float, information: Array, pull: Array
+) -> float:  # fmt: skip
+    """Log likelihood of edges ``doubted`` (bits) that are joint as all of things ``near`` (a variance, px^2) the
+    gripper's own edges: one motion has to put them there.  ``information`` and ``pull`` are those of the own edges and
+    are overwritten; what these explain and half the logarithm of their determinant come off.
+    """
+    total, row_scaled = 0.0, np.empty(SIZE)
+    for edge in range(len(seen.found)):
+        if not (nodes.joint[i, edge] and (doubted >> edge) & 1):
+            continue
+        total -= math.log(2.0 * seen.found[edge])
+        for row in range(2):
+            variance = nodes.noise[i, edge, row] + near
+            share = math.sqrt(nodes.noise[i, edge, row] / variance)
+            zeta = share * nodes.missing[i, edge, row]
+            for j in range(SIZE):
+                row_scaled[j] = share * nodes.rows[i, edge, row, j]
+            add_row(information, pull, row_scaled, zeta, 1.0)
+            total += normal(zeta * math.sqrt(variance), variance)
+    root = np.empty((SIZE, SIZE))
+    total -= root_of(information, root)
+    forward(root, pull)
+    for j in range(SIZE):
+        total += 0.5 * pull[j] * pull[j]
+    return total
 
 
 @compiled

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gripmon.belief.state import FOREIGN_KINDS, LIGHT, SIZE, STILL, Bank, Seen
+from gripmon.belief.state import FAR, FOREIGN_KINDS, LIGHT, NEAR, SIZE, STILL, Bank, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -159,7 +159,7 @@ def fade(bank: Bank, h: int, seen: Seen) -> None:
     """The errors before the backgrounds that are behind the edges now: as like them as the pictures are."""
     for q in range(bank.offset.shape[1]):
         edge = q // 2
-        if not seen.shown[edge]:
+        if seen.found[edge] == 0:
             continue
         s, rho = 1 + seen.background[edge], seen.likeness[edge]
         bank.offset[h, q, s] *= rho
@@ -172,15 +172,15 @@ def fade(bank: Bank, h: int, seen: Seen) -> None:
 
 
 @compiled
-def learn(bank: Bank, h: int, seen: Seen, edge: int) -> None:
-    """Both rows of an edge that is taken for the gripper's own."""
+def learn(bank: Bank, h: int, seen: Seen, edge: int, of: int) -> None:
+    """Both rows of an edge that is taken for the gripper's own, ``of`` the lines there."""
     states, s = bank.offset.shape[2], 1 + seen.background[edge]
     gain, line = np.empty(states), np.empty(SIZE)
     for row in range(2):
         q = 2 * edge + row
         offset, slope, spread = bank.offset[h, q], bank.slope[h, q], bank.spread[h, q]
-        variance = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s] + seen.white[edge, row]
-        missing = seen.measured[edge, row] - offset[0] - offset[s]
+        variance = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s] + seen.white[edge, of, row]
+        missing = seen.lines[edge, of, row] - offset[0] - offset[s]
         for i in range(SIZE):
             line[i] = seen.rows[edge, row, i] + slope[0, i] + slope[s, i]
         for k in range(states):
@@ -201,6 +201,12 @@ def log_sum(a: float, b: float) -> float:
 
 
 @compiled
+def normal(missing: float, variance: float) -> float:
+    """Log density."""
+    return -0.5 * (missing * missing / variance + math.log(2.0 * math.pi * variance))
+
+
+@compiled
 def drawn(place: Array, spread: Array, missing: float, white: float) -> float:
     """Log likelihood of one row, ``missing`` px from where it was searched, whose ``place`` (2,) (place, background)
     with its variances and covariance ``spread`` (3,) learns from it.
@@ -213,47 +219,67 @@ def drawn(place: Array, spread: Array, missing: float, white: float) -> float:
     spread[0] -= of_place * of_place * variance
     spread[1] -= of_place * of_back * variance
     spread[2] -= of_back * of_back * variance
-    return -0.5 * (missing * missing / variance + math.log(2.0 * math.pi * variance))
+    return normal(missing, variance)
 
 
 @compiled
-def foreign(bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, keep: bool) -> float:
+def foreign(
+    bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, at: Array, wide: Array,
+    near: bool, keep: bool,
+) -> float:  # fmt: skip
     """Log likelihood of an edge that is another thing's, by ``sizes`` (3,): variances of near and far, px^2, and the
     probability that the search finds another line of that thing than before, or that it has moved.
 
-    It lies anywhere around where it was searched, and stays there while the picture does; ``held`` moves with the
-    gripper and stays in any case.  ``fresh``: the doubt begins.  ``keep``: it is learnt, and what wasn't shown fades.
+    It lies near where the gripper's own is expected, ``at`` (2,) with variance ``wide`` (2,), or anywhere around where
+    it was searched, is any of the lines there, and stays there while the picture does; ``held`` moves with the gripper
+    and stays in any case.  ``fresh``: the doubt begins.  ``near``: it may be near.  ``keep``: it is learnt, and what
+    wasn't shown fades.
     """
-    shown, strength = seen.shown[edge], seen.strength[edge]
-    like = seen.likeness[edge] if shown else 1.0
+    count, strength = seen.found[edge], seen.strength[edge]
+    like = seen.likeness[edge] if count > 0 else 1.0
     stays = 1.0 if held or like >= STILL else like
-    another = 1.0 if fresh else sizes[2] if shown else 0.0
-    logs, place, spread = np.empty(FOREIGN_KINDS), np.zeros((2, 2, 2)), np.zeros((2, 2, 3))  # it stays, or is drawn
+    another = 1.0 if fresh else sizes[2] if count > 0 else 0.0
+    logs, place, spread = np.empty(FOREIGN_KINDS), np.zeros((2, 2)), np.zeros((2, 3))
+    best, best_spread = np.zeros((2, 2)), np.zeros((2, 3))
     for kind in range(FOREIGN_KINDS):
-        stay, draw = math.log(max(1.0 - another, 1e-300)), math.log(max(another, 1e-300))
-        for row in range(2):
-            was = bank.place_spread[h, edge, kind, row]
-            place[0, row, 0] = stays * bank.place[h, edge, kind, row, 0]
-            place[0, row, 1] = like * bank.place[h, edge, kind, row, 1]
-            spread[0, row, 0] = stays * stays * was[0] + (1.0 - stays * stays) * sizes[kind]
-            spread[0, row, 1] = stays * like * was[1]
-            spread[0, row, 2] = like * like * was[2] + (1.0 - like * like) * strength
-            place[1, row, 0], place[1, row, 1] = 0.0, 0.0
-            spread[1, row, 0], spread[1, row, 1], spread[1, row, 2] = sizes[kind], 0.0, strength
-            if shown:
-                at, white = seen.measured[edge, row], seen.white[edge, row]
-                stay += drawn(place[0, row], spread[0, row], at - bank.searched[h, edge, kind, row], white)
-                draw += drawn(place[1, row], spread[1, row], at - seen.searched[edge, row], white)
-        way = 0 if stay >= draw else 1
-        logs[kind] = (-math.log(2.0) if fresh else bank.kind[h, edge, kind]) + log_sum(stay, draw)
+        most, total = -math.inf, -math.inf
+        again = False
+        for way in range(2):  # it stays, or is drawn
+            share = math.log(max(another if way == 1 else 1.0 - another, 1e-300))
+            for of in range(max(count, 1)):
+                log = share - math.log(max(count, 1))
+                for row in range(2):
+                    around = bank.searched[h, edge, kind, row]
+                    if way == 0:
+                        was = bank.place_spread[h, edge, kind, row]
+                        place[row, 0] = stays * bank.place[h, edge, kind, row, 0]
+                        place[row, 1] = like * bank.place[h, edge, kind, row, 1]
+                        spread[row, 0] = stays * stays * was[0] + (1.0 - stays * stays) * sizes[kind]
+                        spread[row, 1] = stays * like * was[1]
+                        spread[row, 2] = like * like * was[2] + (1.0 - like * like) * strength
+                    else:
+                        around = seen.searched[edge, row]
+                        place[row, 0], place[row, 1] = 0.0, 0.0
+                        spread[row, 0], spread[row, 1], spread[row, 2] = sizes[kind], 0.0, strength
+                        if kind == NEAR:
+                            place[row, 0] = at[row] - around
+                            spread[row, 0] += wide[row]
+                    if count > 0:
+                        missing = seen.lines[edge, of, row] - around
+                        log += drawn(place[row], spread[row], missing, seen.white[edge, of, row])
+                total = log if total == -math.inf else log_sum(total, log)
+                if log > most:
+                    most, again = log, way == 1
+                    best[:, :], best_spread[:, :] = place, spread
+        logs[kind] = (-math.log(2.0) if fresh else bank.kind[h, edge, kind]) + total
         for row in range(2 if keep else 0):
-            if way == 1:
+            if again:
                 bank.searched[h, edge, kind, row] = seen.searched[edge, row]
             for k in range(2):
-                bank.place[h, edge, kind, row, k] = place[way, row, k]
+                bank.place[h, edge, kind, row, k] = best[row, k]
             for k in range(3):
-                bank.place_spread[h, edge, kind, row, k] = spread[way, row, k]
-    total = log_sum(logs[0], logs[1])
+                bank.place_spread[h, edge, kind, row, k] = best_spread[row, k]
+    total = log_sum(logs[NEAR], logs[FAR]) if near else logs[FAR]
     if keep:
         for kind in range(FOREIGN_KINDS):
             bank.kind[h, edge, kind] = logs[kind] - total

@@ -44,13 +44,16 @@ class Candidates(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """A frame: its edges, the doubts and their chances, what witnesses told, and whether it is the first."""
+    """A frame: its edges, the doubts and their chances, what witnesses told, whether it is the first, and what is
+    ``near`` an edge, a variance, px^2.
+    """
 
     seen: Seen
     table: Table
     chances: Chances
     told: Told
     first: bool
+    near: float
 
 
 @compiled
@@ -69,9 +72,8 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
         return n
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     table, before = asked.table, bank.doubts[nodes.parent[i]]
-    log, surprise = weigh(
-        nodes, i, asked.seen, edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges), root, solution
-    )
+    doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
+    log, surprise = weigh(nodes, i, asked.seen, doubted, held, asked.near, root, solution)
     log += nodes.before[i] + log_transition(before, doubts, asked.chances) + across(nodes, i, doubts)
     candidates.node[n], candidates.doubts[n] = i, doubts
     candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first)
@@ -107,7 +109,7 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
     before = bank.doubts[nodes.parent[i]]
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     covered, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-    log, _ = weigh(nodes, i, seen, covered, held, root, solution)
+    log, _ = weigh(nodes, i, seen, covered, held, asked.near, root, solution)
     log += across(nodes, i, doubts)
     candidates.expanded[c] = True
     for k in range(len(table.edges)):

@@ -58,7 +58,9 @@ class Priors:
     focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is
     for good.  ``near_px`` and ``far_px``: where another thing's edge is found, by the width of an edge and by the reach
     of the search; ``another``: probability that the next search finds another one of that thing; ``aligned``: share of
-    what lies over fingers' ends that is straight across them.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
+    what lies over fingers' ends that is straight across them, at ``across_m`` from these along the fingers (half of the
+    search's reach); ``missed``: probability that an edge of the gripper isn't
+    among the lines that were found there.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
     in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis.
     ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
     standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability each time that
@@ -76,6 +78,8 @@ class Priors:
     far_px: float = 7.0
     another: float = 0.01
     aligned: float = 0.5
+    across_m: float = 6e-3
+    missed: float = 0.05
     creep_m_s: float = 3e-6
     creep_rad_s: float = 3e-5
     small_per_s: float = 0.02
@@ -130,17 +134,24 @@ class Bank(NamedTuple):
 
 class Seen(NamedTuple):
     """A frame's edges.  ``rows`` (e, 2, 23): how offset at the middle and slope times half the length, px, change with
-    g (zero for p), ``measured`` (e, 2) and ``white`` (e, 2), the variance of what is new in every frame, px^2;
-    ``shown`` (e,); ``background`` (e,), the remembered one that is behind the edge now; ``likeness`` (e,) of it to when
-    it was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2; ``searched`` (e,
-    2), where the edges were looked for, px.
+    g (zero for p).  Of the lines that were found where an edge was searched, ``found`` (e,) of them, ``lines`` (e, l,
+    2) offset and slope, and ``white`` (e, l, 2), the variance of what is new in every frame, px^2; ``fitted`` (e,): the
+    first is the one that agrees with the fit.  ``background`` (e,), the remembered one that is behind the edge now;
+    ``likeness`` (e,) of it to when it was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's
+    error, px^2; ``searched`` (e, 2), where the edges were looked for, px.
     """
 
     rows: Array
-    measured: Array
+    lines: Array
     white: Array
-    shown: Flags
+    found: Ints
+    fitted: Flags
     background: Ints
     likeness: Array
     strength: Array
     searched: Array
+
+    @property
+    def shown(self) -> Flags:
+        """(e,) whether anything was found."""
+        return self.found > 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from gripmon.belief.core import Belief, Believed
 from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
-from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Priors, Seen
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Ints, Priors, Seen
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
@@ -27,6 +27,11 @@ FEWEST_POINTS = 6
 """Points of an edge from which it has an offset and a slope with a scatter."""
 LEAST_WHITE_PX = 0.02
 """Standard deviation of an edge that no pixel noise explains: interpolation between pixels."""
+MOST_LINES = 3
+WITHIN_PX = 0.6
+"""Distance from a line within which an edgel hypothesis is on it: three standard deviations of the least sure ones."""
+PLACES_PX = np.array([(offset, slope) for offset in np.arange(-7.0, 7.01, 0.3) for slope in np.arange(-2.0, 2.01, 0.5)])
+"""Where lines are looked for (offset, slope): as far as search lines reach."""
 BESIDE_PX, BESIDE_POINTS = 6.0, 12
 """Distance from an edge of the pixels beside it that are compared, clear of its blur, and how many a side."""
 TEXTURE_PX = 0.34 * math.sqrt(40.0)
@@ -126,9 +131,9 @@ class Shadow:
         """The frame's edges; None with too few of them."""
         p, c, fit = measurement.prediction, measurement.candidates, measurement.consensus
         edges = len(self._gripper.edge_ids)
-        rows, measured, white = np.zeros((edges, 2, SIZE)), np.zeros((edges, 2)), np.ones((edges, 2))
-        searched, shown = np.zeros((edges, 2)), np.zeros(edges, bool)
-        strength = np.full(edges, 1.0)
+        rows, lines = np.zeros((edges, 2, SIZE)), np.zeros((edges, MOST_LINES, 2))
+        white, count = np.ones((edges, MOST_LINES, 2)), np.zeros(edges, np.int64)
+        searched, fitted, strength = np.zeros((edges, 2)), np.zeros(edges, bool), np.full(edges, 1.0)
         assert isinstance(frame.image, np.ndarray)
         beside, noise = _beside(frame.image, measurement, edges), c.noise / math.sqrt(3.0)  # of three pixels' mean
         at = self._columns(measurement)
@@ -137,28 +142,39 @@ class Shadow:
         from_reference = at[:, MOTION] @ away + at[:, OPENING] * (p.jaw_opening_m - reported_m)
         edge_of = p.layout.edge[c.sample]
         for edge in measurement.normal.edge:
-            own = np.flatnonzero((edge_of == edge) & (fit.weight > 0.0))
-            sample = c.sample[own]
-            if len(np.unique(sample)) < FEWEST_POINTS or not fit.edge_seen[edge]:
+            own = np.flatnonzero(edge_of == edge)
+            agree = fit.weight[own] > 0.0 if fit.edge_seen[edge] else np.zeros(len(own), bool)
+            search_lines = int(np.count_nonzero(p.layout.edge == edge))
+            found = lines_of(c.offset_px[own], c.sample[own], p.layout.fraction[c.sample[own]], agree, search_lines)
+            if not found:
                 continue
-            fraction = p.layout.fraction[sample]
-            line = _line(fraction, 1.0 / np.square(c.sigma_px[own]))
-            both = line @ np.column_stack([c.offset_px[own], from_reference[sample], at[sample]])
-            left = c.offset_px[own] - _basis(fraction) @ both[:, 0]
-            spread = float(left @ left) / (len(own) - 2)
-            independent = max(float(p.independence[edge]) * len(own), 2.0)
-            measured[edge], searched[edge], rows[edge] = both[:, 0] + both[:, 1], both[:, 1], both[:, 2:]
-            white[edge] = LEAST_WHITE_PX**2 + spread * np.array([1.0, 3.0]) / independent
-            step = float(np.median(np.abs(c.step[own])))
+            first = own[found[0]]
+            fraction = p.layout.fraction[c.sample[first]]
+            line = _line(_basis(fraction, fraction), 1.0 / np.square(c.sigma_px[first]))
+            all_of = line @ np.column_stack([from_reference[c.sample[first]], at[c.sample[first]]])
+            searched[edge], rows[edge] = all_of[:, 0], all_of[:, 1:]
+            for k, on in enumerate(found):
+                points = own[on]
+                basis = _basis(p.layout.fraction[c.sample[points]], fraction)
+                lines[edge, k] = _line(basis, 1.0 / np.square(c.sigma_px[points])) @ c.offset_px[points]
+                left = c.offset_px[points] - basis @ lines[edge, k]
+                spread = float(left @ left) / max(len(points) - 2, 1)
+                single = np.diag(np.linalg.inv(basis.T @ basis)) / float(p.independence[edge])
+                white[edge, k] = LEAST_WHITE_PX**2 + spread * single
+                lines[edge, k] += searched[edge]
+            count[edge], fitted[edge] = len(found), found[0] is agree
+            step = float(np.median(c.step[first]))
             texture = _texture(beside, int(edge), noise)
-            strength[edge] = (TEXTURE_PX * texture / max(step, 1.0)) ** 2 / independent
-            rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(np.median(c.step[own])), 0.0
-            shown[edge] = True
+            strength[edge] = (TEXTURE_PX * texture / max(abs(step), 1.0)) ** 2 / max(
+                float(p.independence[edge]) * len(first), 2.0
+            )
+            rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(step), 0.0
+        shown = count > 0
         if np.count_nonzero(shown) < 3:
             return None
         likeness = np.array([_likeness(beside[e], self._beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         self._beside = np.where(shown[:, None, None], beside, self._beside)
-        return Seen(rows, measured, white, shown, np.zeros(edges, np.int64), likeness, strength, searched)
+        return Seen(rows, lines, white, count, fitted, np.zeros(edges, np.int64), likeness, strength, searched)
 
     def _columns(self, measurement: Measurement) -> Array:
         """(n, 23): how each search line's offset changes with g, at the present pose."""
@@ -193,15 +209,50 @@ def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doub
     return out
 
 
-def _basis(fraction: Array) -> Array:
-    """(n, 2): one, and the way along what is seen of an edge, -1 to 1."""
-    middle, half = 0.5 * (fraction.min() + fraction.max()), 0.5 * (fraction.max() - fraction.min())
+def lines_of(offset_px: Array, sample: Ints, fraction: Array, agree: Flags, search_lines: int) -> list[Flags]:
+    """Which of an edge's edgel hypotheses (n,), at ``offset_px`` on ``sample``, the search line at ``fraction`` of the
+    edge, are on each of the lines there, at most MOST_LINES: first that of those which ``agree`` with the fit, if there
+    are enough, then what at least half of the ``search_lines`` support.
+    """
+    out: list[Flags] = []
+    left, basis = np.ones(len(offset_px), bool), _basis(fraction, fraction)
+
+    def take(on: Flags) -> None:
+        nonlocal left
+        place = np.linalg.lstsq(basis[on], offset_px[on], rcond=None)[0]
+        left = left & (np.abs(offset_px - basis @ place) > 2.0 * WITHIN_PX)
+        out.append(on)
+
+    if len(np.unique(sample[agree])) >= FEWEST_POINTS:
+        take(agree)
+    least = max(FEWEST_POINTS, 0.5 * search_lines)
+    while len(out) < MOST_LINES and len(np.unique(sample[left])) >= least:
+        among = np.flatnonzero(left)
+        hit = np.abs(offset_px[among, None] - basis[among] @ PLACES_PX.T) < WITHIN_PX
+        first = np.concatenate([[0], np.flatnonzero(np.diff(sample[among])) + 1])
+        votes = np.logical_or.reduceat(hit, first, axis=0).sum(axis=0)
+        place = PLACES_PX[int(np.argmax(votes))]
+        if votes.max() < least:
+            break
+        for _ in range(2):
+            on = left & (np.abs(offset_px - basis @ place) < WITHIN_PX)
+            if np.ptp(fraction[on]) == 0.0:
+                return out
+            place = np.linalg.lstsq(basis[on], offset_px[on], rcond=None)[0]
+        if len(np.unique(sample[on])) < FEWEST_POINTS:
+            break
+        take(on)
+    return out
+
+
+def _basis(fraction: Array, along: Array) -> Array:
+    """(n, 2): one, and the way along an edge, -1 to 1 from the first to the last of ``along`` (s,)."""
+    middle, half = 0.5 * (along.min() + along.max()), 0.5 * (along.max() - along.min())
     return np.column_stack([np.ones(len(fraction)), (fraction - middle) / max(half, 1e-9)])
 
 
-def _line(fraction: Array, weight: Array) -> Array:
+def _line(basis: Array, weight: Array) -> Array:
     """(2, n): from values along an edge to their offset at its middle and slope times half its length, weighted."""
-    basis = _basis(fraction)
     weighted = basis.T * weight
     return np.asarray(np.linalg.solve(weighted @ basis, weighted))
 

@@ -118,33 +118,59 @@ def _faded(frames: Sequence[Told], edge: int, i: int, j: int, stays: Array | Non
     return out
 
 
+At = tuple[int, int, int]
+"""Frame, edge and row."""
+
+
 def _gaussian(priors: Priors, frames: Sequence[Told], bad: Array, held: Array) -> tuple[float, Array, Array]:
     edges, log = bad.shape[1], 0.0
     for e in range(edges):
-        log += sum(_stretch(priors, frames, e, a, b, held[:, e]) for a, b in _stretches(bad[:, e]))
-    at = [
-        (t, e, r)
-        for t in range(len(frames))
-        for e in range(edges)
-        for r in (0, 1)
-        if frames[t].seen.shown[e] and not bad[t, e]
-    ]
+        log += sum(_stretch(priors, frames, e, a, b, bad, held[:, e]) for a, b in _stretches(bad[:, e]))
+    at = _own(frames, bad, len(frames))
     prior = priors.covariance()
     if not at:
         return log, np.zeros(len(prior)), prior
-    rows = np.array([frames[t].seen.rows[e, r] for t, e, r in at])
-    values = np.array([frames[t].seen.measured[e, r] for t, e, r in at])
-    noise = np.zeros((len(at), len(at)))
-    for a, (i, e, r) in enumerate(at):
-        for b, (j, other, row) in enumerate(at):
-            if (e, r) == (other, row):
-                strength = float(frames[i].seen.strength[e])
-                noise[a, b] = priors.lasting_px**2 + strength * _faded(frames, e, i, j)
-                noise[a, b] += float(frames[i].seen.white[e, r]) if i == j else 0.0
+    rows, values = _rows(frames, at), np.array([frames[t].seen.lines[e, 0, r] for t, e, r in at])
+    noise = _noise(priors, frames, at, at) + np.diag([float(frames[t].seen.white[e, 0, r]) for t, e, r in at])
     covariance = rows @ prior @ rows.T + noise
     gain = prior @ rows.T @ np.linalg.inv(covariance)
     left = np.eye(len(prior)) - gain @ rows
     return log + _normal(values, covariance), gain @ values, left @ prior @ left.T + gain @ noise @ gain.T
+
+
+def _own(frames: Sequence[Told], bad: Array, end: int) -> list[At]:
+    """Rows before a frame that are taken for the gripper's."""
+    shown = [(t, e) for t in range(end) for e in range(bad.shape[1]) if frames[t].seen.shown[e] and not bad[t, e]]
+    return [(t, e, r) for t, e in shown for r in (0, 1)]
+
+
+def _rows(frames: Sequence[Told], at: Sequence[At]) -> Array:
+    return np.array([frames[t].seen.rows[e, r] for t, e, r in at])
+
+
+def _noise(priors: Priors, frames: Sequence[Told], at: Sequence[At], others: Sequence[At]) -> Array:
+    """What the lasting errors and those of the backgrounds make of rows, two by two."""
+    out = np.zeros((len(at), len(others)))
+    for a, (i, e, r) in enumerate(at):
+        for b, (j, other, row) in enumerate(others):
+            if (e, r) == (other, row):
+                out[a, b] = priors.lasting_px**2 + float(frames[i].seen.strength[e]) * _faded(frames, e, i, j)
+    return out
+
+
+def _expected(priors: Priors, frames: Sequence[Told], bad: Array, at: At) -> tuple[float, float]:
+    """Where a row of the gripper's would be by what was seen before, and its variance but for the white one."""
+    before, prior = _own(frames, bad, at[0]), priors.covariance()
+    row = _rows(frames, [at])
+    alone = float((row @ prior @ row.T + _noise(priors, frames, [at], [at]))[0, 0])
+    if not before:
+        return 0.0, alone
+    rows, values = _rows(frames, before), np.array([frames[t].seen.lines[e, 0, r] for t, e, r in before])
+    noise = _noise(priors, frames, before, before)
+    white = np.diag([float(frames[t].seen.white[e, 0, r]) for t, e, r in before])
+    cross = (row @ prior @ rows.T + _noise(priors, frames, [at], before))[0]
+    gain = np.linalg.solve(rows @ prior @ rows.T + noise + white, cross)
+    return float(gain @ values), alone - float(gain @ cross)
 
 
 def _stretches(bad: Array) -> list[tuple[int, int]]:
@@ -152,20 +178,27 @@ def _stretches(bad: Array) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _stretch(priors: Priors, frames: Sequence[Told], edge: int, start: int, end: int, held: Array) -> float:
+def _stretch(
+    priors: Priors, frames: Sequence[Told], edge: int, start: int, end: int, bad: Array, held: Array
+) -> float:  # fmt: skip
     shown = [t for t in range(start, end) if frames[t].seen.shown[edge]]
     if not shown:
         return 0.0
-    parts = []
-    for size in (priors.near_px, priors.far_px):
+    seen, parts = frames[start].seen, []
+    for near, size in ((True, priors.near_px), (False, priors.far_px)):
         part = math.log(0.5)
         for r in (0, 1):
-            values = [float(frames[t].seen.measured[edge, r] - frames[start].seen.searched[edge, r]) for t in shown]
+            away, wide = 0.0, 0.0  # where it is drawn beside where it was searched
+            if near and seen.shown[edge]:
+                place, wide = _expected(priors, frames, bad, (start, edge, r))
+                away = place - float(seen.searched[edge, r])
+            left = [_faded(frames, edge, start, t, held) for t in shown]
+            values = [float(frames[t].seen.lines[edge, 0, r] - seen.searched[edge, r]) for t in shown]
             covariance = np.array([[
-                size**2 * _faded(frames, edge, i, j, held)
+                size**2 * _faded(frames, edge, i, j, held) + wide * left[a] * left[b]
                 + float(frames[i].seen.strength[edge]) * _faded(frames, edge, i, j)
-                + (float(frames[i].seen.white[edge, r]) if i == j else 0.0)
-                for j in shown] for i in shown])  # fmt: skip
-            part += _normal(np.array(values), covariance)
+                + (float(frames[i].seen.white[edge, 0, r]) if i == j else 0.0)
+                for b, j in enumerate(shown)] for a, i in enumerate(shown)])  # fmt: skip
+            part += _normal(np.array(values) - away * np.array(left), covariance)
         parts.append(part)
     return float(np.logaddexp(*parts))

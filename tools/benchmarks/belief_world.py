@@ -24,6 +24,8 @@ WHITE_PX, BACKGROUND_PX = 0.02, 0.10
 RIGHT, WRONG = np.array([0.05, 0.25, 0.70]), np.array([0.62, 0.36, 0.02])
 """Of a finger's 0, 1 or 2 indications of an end, by whether it is one."""
 MEMORY = 0.95
+OTHERS = 0.15
+"""How often another line is found beside an edge (0.1 to 0.25 in rendered and simulated scenes)."""
 _FOCAL_PX, _DISTANCE_M = 600.0, 0.12
 
 
@@ -202,12 +204,24 @@ class World:
             if self.view.doubts[i].held and self.view.names[i] in ("ends", "all ends", "inner", "side"):
                 shown &= ~self.view.doubts[i].edges
         where = np.where(foreign[:, None], self._around + self._place, own + self._lasting)
-        measured = where + self._back + self._noise(WHITE_PX, edges)
+        lines, count, fitted = self._lines(where + self._back + self._noise(WHITE_PX, edges), shown, own)
         seen = Seen(
-            self.view.rows, measured, np.full((edges, 2), WHITE_PX**2), shown, np.zeros(edges, np.int64),
+            self.view.rows, lines, np.full(lines.shape, WHITE_PX**2), count, fitted, np.zeros(edges, np.int64),
             self._told_likeness(like), np.full(edges, BACKGROUND_PX**2), own,
         )  # fmt: skip
         return Sample(seen, self._witnesses(first), light, self._g[MOTION].copy(), self._on.copy())
+
+    def _lines(self, measured: Array, shown: Flags, own: Array) -> tuple[Array, NDArray[np.int64], Flags]:
+        """Lines (e, 2, 2) where edges were searched, how many (e,), and whether the first is the fit's (e,): what is
+        there and now and then another beside it, or only that.
+        """
+        rng, priors, edges = self._rng, self._priors, len(shown)
+        other = own + rng.normal(0.0, priors.far_px, (edges, 2))
+        lines = np.stack([measured, other], axis=1)
+        missed = rng.random(edges) < priors.missed
+        lines[missed, 0] = other[missed]
+        two = shown & ~missed & (rng.random(edges) < OTHERS)
+        return lines, np.where(two, 2, np.where(shown, 1, 0)), shown & ~missed
 
     def _told_likeness(self, like: Array) -> Array:
         if "likeness" not in self._differs or self._t == 0:
