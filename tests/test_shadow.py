@@ -13,7 +13,7 @@ from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, Seen
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.shadow import Shadow, _alike, _texture
+from gripmon.monitor.shadow import Shadow, _alike, _texture, lines_of
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
 
@@ -114,6 +114,25 @@ def test_texture_is_the_scatter_without_noise_and_shading() -> None:
         side = 100.0 + np.linspace(0.0, 20.0, 12) + rng.normal(0.0, 3.0, 12) + rng.normal(0.0, 1.0, 12)
         found.append(_texture(side[None, None].repeat(2, axis=1), 0, 1.0) ** 2)
     assert np.mean(found) == pytest.approx(9.0, rel=0.1)
+
+
+def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None:
+    """Twenty search lines: the fit's line, another 4 px beside and oblique, a third that too few show, and noise."""
+    rng, fraction = np.random.default_rng(6), np.linspace(0.1, 0.9, 20)
+    way = np.linspace(-1.0, 1.0, 20)
+    rows = [(0.3 * np.ones(20), np.ones(20, bool)), (4.0 + 0.8 * way, rng.random(20) < 0.8)]
+    rows += [(-5.0 * np.ones(20), np.arange(20) < 7), (rng.uniform(-7.0, 7.0, 20), rng.random(20) < 0.5)]
+    sample = np.concatenate([np.flatnonzero(there) for _, there in rows])
+    of = np.concatenate([np.full(there.sum(), k) for k, (_, there) in enumerate(rows)])
+    offset = np.concatenate([at[there] for at, there in rows]) + rng.normal(0.0, 0.05, len(sample))
+    order = np.argsort(sample, kind="stable")
+    sample, of, offset = sample[order], of[order], offset[order]
+    first, second = lines_of(offset, sample, fraction[sample], of == 0, 20)
+    assert (first == (of == 0)).all()
+    assert second[of == 1].mean() > 0.9
+    assert second[of != 1].sum() <= 2
+    assert len(lines_of(offset, sample, fraction[sample], np.zeros(len(of), bool), 20)) == 2
+    assert lines_of(offset[of == 3], sample[of == 3], fraction[sample[of == 3]], np.zeros((of == 3).sum(), bool), 20) == []
 
 
 def test_records_are_the_same_with_and_without() -> None:

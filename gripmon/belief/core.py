@@ -202,13 +202,19 @@ class Belief:
 
     def _predict(self, dt_s: float, light: float, opening_m: float) -> None:
         priors, root_dt = self.priors, math.sqrt(dt_s)
-        rows = np.zeros((8, SIZE))
-        rows[range(6), range(6)] = np.repeat([priors.creep_m_s * root_dt, priors.creep_rad_s * root_dt], 3)
-        rows[6, LIGHT], rows[7, OPENING] = priors.light_px * math.sqrt(1.0 - light * light), opening_m
-        factor = rows[rows.any(axis=1)]
         lag = min(1.0 - math.exp(-dt_s / LATELY_S), MOST_LAG)
+        factors = []
+        for step_m, step_rad in (
+            (priors.creep_m_s, priors.creep_rad_s),
+            (priors.small_m, priors.small_rad),
+        ):
+            rows = np.zeros((8, SIZE))
+            rows[range(6), range(6)] = np.repeat([step_m * root_dt, step_rad * root_dt], 3)
+            rows[6, LIGHT], rows[7, OPENING] = priors.light_px * math.sqrt(1.0 - light * light), opening_m
+            factors.append(rows[rows.any(axis=1)])
         for h in range(self._hypotheses):
             move(self._bank, h, lag, light)
+            factor = factors[int(bool(self._bank.doubts[h] & self._table.moves))]
             if factor.any():
                 add_noise(self._bank, h, self._bank.mean[h], self._bank.covariance[h], factor)
 

@@ -32,11 +32,13 @@ class Rates:
 
 
 # Policy, from design: one edge in a hundred is mistaken at first; something is held or lies beside the fingers every
-# 50 s, for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days.
+# 50 s, for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days; the mount is loose
+# (it vibrates, flexes, creeps) as often, and as long, as something is held.
 EDGE = Rates(1e-2, 1e-3, 5e-3, 0.0, 0.7)
 GROUP = Rates(1e-2, 0.02, leaves_per_s=0.2)
 ALL_ENDS = Rates(1e-1, 0.02, leaves_per_s=0.2)
 FINGER = Rates(1e-3, 1e-6)
+LOOSE = Rates(1e-2, 0.02, leaves_per_s=0.2)
 FOOLED_SHARE = 3.0 / 178.0
 """Share of wrong ends at which the witnesses answer as at right ones: 3/n of the 178 wrong fits that were looked at,
 none of which did.
@@ -47,6 +49,7 @@ none of which did.
 class Doubt:
     """``edges`` (e,) that are something else's while it lasts; ``ends`` (f,) of fingers that are then not the ends;
     ``fooled``: the witnesses of these answer all the same as for right ones.  What is ``held`` moves with the gripper.
+    ``moves``: while it lasts, the mount does.
     """
 
     edges: Flags
@@ -54,6 +57,12 @@ class Doubt:
     ends: Flags
     held: bool = True
     fooled: bool = False
+    moves: bool = False
+
+
+def of_mount(edges: int, fingers: int) -> Doubt:
+    """It is loose."""
+    return Doubt(np.zeros(edges, bool), LOOSE, np.zeros(fingers, bool), moves=True)
 
 
 def of_edges(edges: int, fingers: int) -> list[Doubt]:
@@ -75,14 +84,15 @@ def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
 
 
 class Table(NamedTuple):
-    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held`` and ``fooled``
-    as bits of doubts, ``at_ends`` as bits of edges.  ``rates`` (d, 5) in the order of :class:`Rates`.
+    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled``
+    and ``moves`` as bits of doubts, ``at_ends`` as bits of edges.  ``rates`` (d, 5) in the order of :class:`Rates`.
     """
 
     edges: Ints
     ends: Ints
     held: int
     fooled: int
+    moves: int
     at_ends: int
     rates: Array
 
@@ -96,7 +106,7 @@ class Table(NamedTuple):
         rates = np.array([astuple(d.rates) for d in doubts])
         return cls(
             np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
-            _bits([d.fooled for d in doubts]), _bits(at_ends), rates,
+            _bits([d.fooled for d in doubts]), _bits([d.moves for d in doubts]), _bits(at_ends), rates,
         )  # fmt: skip
 
 

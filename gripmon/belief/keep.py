@@ -55,12 +55,15 @@ def same_place(mean: Array, covariance: Array, other: Array, other_covariance: A
 
 @compiled
 def same_doubts(one: int, other: int, table: Table) -> bool:
-    """Whether two sets doubt the same edges, held alike, and the same ends, which witnesses are fooled about alike.
+    """Whether two sets doubt the same edges, held alike, and the same ends, which witnesses are fooled about alike, and
+    the mount alike.
 
     The ends of all fingers, or of each: they differ in nothing that is seen before one of them leaves.
     """
     if one == other:
         return True
+    if (one ^ other) & table.moves:
+        return False
     held = edges_of(one & table.held, table.edges) == edges_of(other & table.held, table.edges)
     if not held or edges_of(one, table.edges) != edges_of(other, table.edges):
         return False

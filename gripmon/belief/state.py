@@ -61,7 +61,8 @@ class Priors:
     what lies over fingers' ends that is straight across them, at ``across_m`` from these along the fingers (half of the
     search's reach); ``missed``: probability that an edge of the gripper isn't
     among the lines that were found there.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
-    in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis.
+    in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a
+    second's square root while it is loose.
     ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
     standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability each time that
     all ends begin to be doubted (policy: what hides them is what knocks).  ``opening_per_s``: the reported opening is

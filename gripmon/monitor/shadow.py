@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from gripmon.belief.core import Belief, Believed
-from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
+from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
 from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Ints, Priors, Seen
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
@@ -195,7 +195,7 @@ class Shadow:
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
     """What may be wrong with a gripper's edges."""
     edges, fingers = len(gripper.edge_ids), len(gripper.finger_ids)
-    out = of_edges(edges, fingers) + of_ends(ends_of)
+    out = [*of_edges(edges, fingers), *of_ends(ends_of), of_mount(edges, fingers)]
     inner = inner_edges(gripper)
     nobody = np.zeros(fingers, bool)
     groups = [(inner & along, GROUP), (inner, GROUP), *((side, GROUP) for side in sides(gripper))]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends
+from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
 from gripmon.belief.state import FOCAL, LIGHT, MOTION, OPENING, SIZE, STILL, Priors, Seen
 from gripmon.model.records import Array
 
@@ -129,6 +129,8 @@ def _doubts(edges: Sequence[Edge]) -> tuple[tuple[Doubt, ...], tuple[str, ...]]:
     for d in of_ends([~along & (finger == f) for f in (0, 1)]):
         doubts.append(d)
         names.append(("fooled " if d.fooled else "") + ("all ends" if d.ends.all() else "ends"))
+    doubts.append(of_mount(len(edges), 2))
+    names.append("loose")
     groups = [("plate", inner & along & (side == 0), GROUP), ("inner", inner, GROUP)]
     groups += [("side", along & (side == s), GROUP) for s in (0, 1)]
     groups += [("finger", finger == f, FINGER) for f in (0, 1)]
@@ -237,6 +239,8 @@ class World:
         self._g[MOTION] += rng.normal(size=6) * creep
         if rng.random() < priors.small_per_s * DT_S * (10.0 if "rates" in self._differs else 1.0):
             self._g[MOTION] += rng.normal(size=6) * small
+        if self._on[self.view.names.index("loose")]:
+            self._g[MOTION] += rng.normal(size=6) * small * math.sqrt(DT_S)
         if self._t == self.at:
             if self._fault in ("knock", "knock unseen"):
                 self._g[MOTION] += self._knock()
