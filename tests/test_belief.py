@@ -53,9 +53,10 @@ def frames_of(
         back = rho[:, None] * back + np.sqrt(1.0 - rho[:, None] ** 2) * rng.normal(0.0, 0.1, (edges, 2))
         y = rows @ g + lasting + back + rng.normal(0.0, 0.02, (edges, 2))
         y += 0.0 if clean else (rng.random(edges) < 0.3)[:, None] * rng.normal(0.0, 0.3, (edges, 2))
+        zeros, white = np.zeros(edges, np.int64), np.full((edges, 1, 2), 4e-4)
         seen = Seen(
-            rows, y[:, None], np.full((edges, 1, 2), 4e-4), np.ones(edges, np.int64), np.ones(edges, bool),
-            np.zeros(edges, np.int64), rho, np.full(edges, 1e-2), rows @ g,
+            rows[:, None], y[:, None], white, (rows @ g)[:, None], y[:, None], white, zeros + 1, zeros, zeros.copy(),
+            rho, np.full(edges, 1e-2), rows @ g,
         )  # fmt: skip
         answer = rng.integers(0, 3, 2)
         repeats = (
@@ -111,7 +112,7 @@ def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_plac
     ]  # fmt: skip
     belief = Belief(doubts, ALONG, STEADY, everything=True)
     belief.update(frame, DT_S)
-    rows, values = frame.rows.reshape(-1, SIZE), frame.lines[:, 0].ravel()
+    rows, values = frame.rows[:, 0].reshape(-1, SIZE), frame.lines[:, 0].ravel()
     assert (np.einsum("qi,ij,qj->q", rows, STEADY.covariance(), rows)[::2] > 1.0).all()
     noise = STEADY.lasting_px**2 + 1e-2 + 4e-4
 
@@ -124,7 +125,7 @@ def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_plac
 
         if not bad.any():
             return normal(bad, 0.0, ~bad)
-        away = values[bad] - frame.searched.ravel()[bad]
+        away = values[bad] - frame.searched[:, 0].ravel()[bad]
         far = stats.norm(0.0, np.sqrt(STEADY.far_px**2 + 1e-2 + 4e-4)).logpdf(away).sum()
         own = 0.0 if bad.all() else normal(bad, 0.0, ~bad)
         both = np.logaddexp(normal(bad, STEADY.near_px**2, np.ones(8, bool)), own + far)
@@ -168,7 +169,8 @@ def test_two_pictures_in_turn_tell_what_two_pictures_tell() -> None:
         rng = np.random.default_rng(3)
         belief = Belief(never(8), ALONG, STEADY, everything=True, backgrounds=backgrounds)
         for t, frame in enumerate(frames_of(rng, 8, count, 0.0)):
-            seen = frame.seen._replace(white=np.full((8, 1, 2), white_px**2))
+            white = np.full((8, 1, 2), white_px**2)
+            seen = frame.seen._replace(white=white, image_white=white)
             seen.background[:] = t % 2 % backgrounds
             seen.likeness[:] = 0.99999 if t >= 2 and backgrounds > 1 else 0.0
             belief.update(seen, DT_S)
@@ -192,7 +194,7 @@ def test_a_creeping_mount_before_a_still_picture_is_as_sure_as_the_full_filter_s
         for t, frame in enumerate(frames):
             step = np.repeat([priors.creep_m_s, priors.creep_rad_s], 3) * np.sqrt(DT_S)
             d = d + (rng.normal(size=6) * step if t else 0.0)
-            frame.seen.lines[:, 0] += frame.seen.rows[:, :, MOTION] @ d
+            frame.seen.lines[:, 0] += frame.seen.rows[:, 0, :, MOTION] @ d
             belief.update(frame.seen, DT_S)
         mean, covariance = belief.moments
         full = full_filter(priors, frames)
@@ -205,7 +207,7 @@ def test_a_creeping_mount_before_a_still_picture_is_as_sure_as_the_full_filter_s
 
 def full_filter(priors: Priors, frames: list[Frame]) -> np.ndarray:
     """(6, 6) covariance of d by a Kalman filter over g and both errors of each row."""
-    rows = frames[0].seen.rows.reshape(-1, SIZE)
+    rows = frames[0].seen.rows[:, 0].reshape(-1, SIZE)
     q = len(rows)
     covariance = np.zeros((SIZE + 2 * q, SIZE + 2 * q))
     covariance[:SIZE, :SIZE] = priors.covariance()
@@ -241,7 +243,7 @@ def test_odds_for_the_wrong_side_are_as_rare_as_they_say(like: float) -> None:
                 if t:
                     place = stays * place + np.sqrt(1.0 - stays**2) * rng.normal(0.0, size, 2)
                     back = like * back + np.sqrt(1.0 - like**2) * rng.normal(0.0, 0.1, 2)
-                frame.seen.lines[0, 0] = frames[0].seen.searched[0] + place + back + rng.normal(0.0, 0.02, 2)
+                frame.seen.lines[0, 0] = frames[0].seen.searched[0, 0] + place + back + rng.normal(0.0, 0.02, 2)
         doubt = Doubt(np.arange(6) == 0, Rates(0.5, 0.0), np.zeros(2, bool), held=False)
         belief, lied = Belief([doubt], ALONG, STEADY, everything=True), False
         for frame in frames:
@@ -330,8 +332,13 @@ def test_an_edge_that_becomes_foreign_is_found_by_the_search_alone(searching: bo
 
 def offered(frame: Seen, lines: np.ndarray, fitted: np.ndarray) -> Seen:
     """The same with ``lines`` (e, l, 2) instead of its own."""
+    count = lines.shape[1]
+    rows, searched = np.repeat(frame.rows, count, axis=1), np.repeat(frame.searched, count, axis=1)
     white = np.full(lines.shape, frame.white[0, 0, 0])
-    return frame._replace(lines=lines, white=white, found=np.full(len(lines), lines.shape[1]), fitted=fitted)
+    return frame._replace(
+        rows=rows, lines=lines, white=white, searched=searched, image=lines, image_white=white,
+        found=np.full(len(lines), count), fitted=fitted,
+    )
 
 
 def test_an_edge_is_the_line_where_it_is_expected_whatever_the_fit_chose() -> None:
@@ -343,10 +350,10 @@ def test_an_edge_is_the_line_where_it_is_expected_whatever_the_fit_chose() -> No
         belief = Belief(of_edges(8, 2), ALONG, priors)
         for frame in frames:
             own = frame.seen.lines[:, 0]
-            beside = np.where(np.arange(8)[:, None] == 0, own + [3.0, 0.3], own - [5.0, 0.0])
+            beside = own + np.where(np.arange(8)[:, None] == 0, [[3.0, 0.3]], [[-5.0, 0.0]])
             lines = np.stack([beside, own], axis=1)
             lines[1:] = lines[1:, ::-1]
-            believed = belief.update(offered(frame.seen, lines if both else lines[:, :1], np.ones(8, bool)), DT_S)
+            believed = belief.update(offered(frame.seen, lines if both else lines[:, :1], np.zeros(8, np.int64)), DT_S)
         assert np.linalg.norm(believed.motion[:3]) < believed.bound.position_m < 1e-3
         weights[both] = sum(weight for doubts, weight in belief.weights.items() if doubts & 1)
     assert weights[True] < 0.01 < 0.5 < weights[False]
@@ -375,14 +382,15 @@ def test_a_mount_that_is_put_aside_and_back_is_followed_each_time() -> None:
     edges = len(view.along)
     aside = np.array([0.0, 4.5e-3, -1.1e-3, -30e-3, 0.0, 0.0])
     belief = Belief(view.doubts, view.axis)
-    lasting = rng.normal(0.0, 0.05, (edges, 2))
+    lasting, zeros = rng.normal(0.0, 0.05, (edges, 2)), np.zeros(edges, np.int64)
+    white = np.full((edges, 1, 2), 4e-4)
     for t in range(12):
         motion = aside * (1.0 + 0.1 * rng.normal()) * (t % 2)
         at = view.rows[:, :, MOTION] @ motion
         lines = at + lasting + rng.normal(0.0, 0.1, (edges, 2))
         seen = Seen(
-            view.rows, lines[:, None], np.full((edges, 1, 2), 4e-4), np.ones(edges, np.int64), np.ones(edges, bool),
-            np.zeros(edges, np.int64), np.zeros(edges), np.full(edges, 1e-2), at,
+            view.rows[:, None], lines[:, None], white, at[:, None], lines[:, None], white, zeros + 1, zeros, zeros,
+            np.zeros(edges), np.full(edges, 1e-2), at,
         )  # fmt: skip
         believed = belief.update(seen, DT_S)
         off = believed.motion - motion
@@ -395,16 +403,16 @@ def test_a_mount_that_creeps_fast_is_followed_as_one_that_is_loose() -> None:
     off_m, loose = {}, {}
     for doubts in ([*of_edges(8, 2), of_mount(8, 2)], of_edges(8, 2)):
         frames = frames_of(np.random.default_rng(3), 8, 90, 0.999, clean=True)
-        belief, off = Belief(doubts, ALONG, replace(Priors(), small_per_s=1e-9)), []
+        belief, off = Belief(doubts, ALONG, Priors()), []
         for t, frame in enumerate(frames):
             motion = t * np.array([2e-6, 13e-6, 0.0, -1.5e-4, 0.0, 0.0])
-            frame.seen.lines[:, 0] += frame.seen.rows[:, :, MOTION] @ motion
+            frame.seen.lines[:, 0] += frame.seen.rows[:, 0, :, MOTION] @ motion
             believed = belief.update(frame.seen, DT_S)
             off.append(np.linalg.norm((believed.motion - motion)[:3]))
             assert off[-1] < believed.bound.position_m < 1e-4
         off_m[len(doubts)], loose[len(doubts)] = np.mean(off), sum(w for d, w in belief.weights.items() if d >> 8 & 1)
     assert loose[9] > 0.99
-    assert off_m[9] < 0.5 * off_m[8]
+    assert off_m[9] < 0.6 * off_m[8]
 
 
 @pytest.mark.parametrize(("fault", "within"), [(None, 0.9), ("knock", 0.7), ("opening", 0.8)])

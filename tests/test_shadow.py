@@ -13,9 +13,11 @@ from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, Seen
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.shadow import Shadow, _alike, _texture, lines_of
+from gripmon.monitor.edge_lines import lines_of
+from gripmon.monitor.shadow import Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
+from gripmon.track.edges import Measurement
 
 FRAME_S = 1.0 / 30.0
 
@@ -25,8 +27,8 @@ class Watching(Shadow):
 
     seen: Seen
 
-    def _seen(self, frame: Frame, measurement: object) -> Seen | None:
-        seen = super()._seen(frame, measurement)  # type: ignore[arg-type]
+    def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
+        seen = super()._seen(frame, looks, fit)
         assert seen is not None
         self.seen = seen
         return seen
@@ -57,8 +59,8 @@ def test_rows_say_what_a_moved_gripper_does_to_the_picture(xi: np.ndarray) -> No
     assert both.sum() >= 8
     shift = after.lines[both, 0] - before.lines[both, 0]
     assert np.abs(shift).max() > 0.3
-    assert shift == pytest.approx(before.rows[both][:, :, MOTION] @ (2.0 * xi), abs=0.08)
-    assert np.array_equal(before.rows[:, :, MOTION], before.rows[:, :, REFERENCE])
+    assert shift == pytest.approx(before.rows[both, 0][:, :, MOTION] @ (2.0 * xi), abs=0.08)
+    assert np.array_equal(before.rows[..., MOTION], before.rows[..., REFERENCE])
 
 
 def _at(pose: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -80,7 +82,7 @@ def test_a_longer_lens_and_brighter_light_move_edges_as_their_columns_say() -> N
     for other, column, by in ((longer, FOCAL, np.log(grown)), (spread, LIGHT, 1.0)):
         both = plain.shown & other.shown
         shift = other.lines[both, 0, 0] - plain.lines[both, 0, 0]
-        wanted = by * plain.rows[both, 0, column]
+        wanted = by * plain.rows[both, 0, 0, column]
         assert np.abs(wanted).max() > 0.5
         assert shift == pytest.approx(wanted, abs=0.08 if column == FOCAL else 0.45)  # a square spreads more
 
@@ -88,7 +90,7 @@ def test_a_longer_lens_and_brighter_light_move_edges_as_their_columns_say() -> N
 def test_only_ends_tell_of_lengths() -> None:
     image, opening_m = picture(nominal_cam_T_grip())
     seen = seen_in(image, nominal_cam_T_grip(), opening_m)
-    lengths = np.abs(seen.rows[:, 0, LENGTHS])
+    lengths = np.abs(seen.rows[:, 0, 0, LENGTHS])
     finger = sharp_gripper().edge_finger
     tips = np.array(["tip" in name for name in sharp_gripper().edge_ids]) & seen.shown
     assert tips.any()
@@ -132,7 +134,8 @@ def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None
     assert second[of == 1].mean() > 0.9
     assert second[of != 1].sum() <= 2
     assert len(lines_of(offset, sample, fraction[sample], np.zeros(len(of), bool), 20)) == 2
-    assert lines_of(offset[of == 3], sample[of == 3], fraction[sample[of == 3]], np.zeros((of == 3).sum(), bool), 20) == []
+    noise = of == 3
+    assert lines_of(offset[noise], sample[noise], fraction[sample[noise]], np.zeros(noise.sum(), bool), 20) == []
 
 
 def test_records_are_the_same_with_and_without() -> None:

@@ -15,8 +15,8 @@ import numpy as np
 
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
-from gripmon.belief.keep import keep, remember
-from gripmon.belief.nodes import Nodes, lie_across, prepare
+from gripmon.belief.keep import keep, remember, same_place
+from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
 from gripmon.belief.rows import add_noise, fade, move
 from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search
 from gripmon.belief.state import (
@@ -74,12 +74,13 @@ class Believed(NamedTuple):
 
 
 class Jumps(NamedTuple):
-    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), with ``factors`` (j, 6, 23) of its
-    covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): it is one.
+    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), or is so ``at_first`` (j,), with ``factors``
+    (j, 6, 23) of its covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): it is one.
     """
 
     share: Array
     per_s: Array
+    at_first: Array
     factors: Array
     ranks: Ints
     knock: Array
@@ -113,7 +114,9 @@ class Jumps(NamedTuple):
         padded = np.zeros((len(factors), 6, SIZE))
         for j, rows in enumerate(factors):
             padded[j, : len(rows)] = rows
-        return cls(np.array(shares), np.array(rates), padded, np.array([len(f) for f in factors]), np.array(knock))
+        at_first = np.where(np.arange(len(factors)) == len(factors) - 1, priors.opening_first, 0.0)
+        ranks = np.array([len(f) for f in factors])
+        return cls(np.array(shares), np.array(rates), at_first, padded, ranks, np.array(knock))
 
 
 class Belief:
@@ -141,13 +144,14 @@ class Belief:
         kept = _MOST_CANDIDATES if everything else most + 1
         listed = kept if everything else kept + _MOST_LISTED
         self._bank, self._other = (Bank.empty(listed, self._edges, backgrounds) for _ in range(2))
-        self._nodes = Nodes.empty(kept * (1 if everything else 1 + len(self._jumps.share)), self._edges, len(doubts))
+        nodes = kept * (1 if everything else 1 + len(self._jumps.share))
+        self._nodes = Nodes.empty(nodes, self._edges, len(doubts), self._fingers)
         self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
         self._bank.covariance[0] = self.priors.covariance() if covariance is None else covariance
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._blind, self._began = np.zeros(1, bool), np.zeros(1, bool)  # hypotheses that trust no end, and since now
+        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end that was shown in the last frame
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
     @property
@@ -168,6 +172,16 @@ class Belief:
         away = means - mean
         return mean, np.einsum("h,hij->ij", weights, self._bank.covariance[:n]) + (weights[:, None] * away).T @ away
 
+    @property
+    def places(self) -> list[tuple[Array, Array]]:
+        """Mean (23,) and covariance (23, 23) of each place, the heaviest first."""
+        bank, out = self._bank, list[tuple[Array, Array]]()
+        for h in np.argsort(-bank.log_weight[: self._hypotheses]):
+            here = bank.mean[h], bank.covariance[h]
+            if not any(same_place(there[0], there[1], here[0], here[1]) for there in out):
+                out.append(here)
+        return out
+
     def update(
         self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0,
         hidden_knock: float = 0.0, opening_m: float = 0.0,
@@ -175,8 +189,8 @@ class Belief:
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
         0. ``opening_m``: standard deviation of what the reported opening's error has changed by.  ``hidden_knock``:
         probability of a knock that is due in this frame because no end is shown (policy; once for each such stretch),
-        beside that of the rate; hypotheses that begin to doubt all ends have it in any case.  Raises ValueError unless
-        time goes on.
+        beside that of the rate; hypotheses that begin to trust none that is shown have it in any case.  Raises
+        ValueError unless time goes on.
         """
         first = self._first
         if not dt_s > 0.0:
@@ -232,13 +246,37 @@ class Belief:
                 n = put_all(candidates, n, nodes, h, bank, asked)
             return n
         least = -math.log(self.least)
-        if not asked.first:
-            n = self._jump(n, asked, dt_s, hidden_knock, least)
+        n = self._jump(n, asked, dt_s, hidden_knock, least)
         if asked.first or self._lost:
             for h in np.argsort(-bank.log_weight[: self._hypotheses])[:AT_ONCE]:
                 n = put_pairs(candidates, n, nodes, int(h), bank, asked)
         reach = -math.log(0.3 * self.risk)
-        return int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
+        n = int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
+        return n if asked.first else self._knock_unseen(n, asked, least)
+
+    def _knock_unseen(self, n: int, asked: Asked, least: float) -> int:
+        """Sets that trust no end that is shown, since now, also after each knock: what hides the ends is what knocks,
+        and a knock is what may hide them.
+        """
+        bank, nodes, candidates, jumps = self._bank, self._nodes, self._candidates, self._jumps
+        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(asked.seen.shown))
+        i = 1 + int(candidates.node[:n].max())
+        due = math.log(max(self.priors.unseen_knock, 1e-300))
+        floor = float(candidates.log_weight[:n].max()) - least - due
+        made: dict[tuple[int, int], int] = {}
+        for c in np.flatnonzero(candidates.log_weight[:n] > floor) if shown else ():
+            h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
+            trusts = shown & ~edges_of(doubts, self._table.edges) != 0
+            if trusts or self._blind[h] or nodes.jump[candidates.node[c]] >= 0:
+                continue
+            for j in np.flatnonzero(jumps.knock):
+                if (h, int(j)) not in made and i < len(nodes.parent):
+                    factor = jumps.factors[j, : jumps.ranks[j]]
+                    self._node(i, h, int(j), float(bank.log_weight[h] + due + math.log(jumps.share[j])), factor, asked)
+                    made[h, int(j)], i = i, i + 1
+                if (h, int(j)) in made:
+                    n = put(candidates, n, nodes, made[h, int(j)], doubts, bank, asked)
+        return n
 
     def _jump(self, n: int, asked: Asked, dt_s: float, hidden_knock: float, least: float) -> int:
         """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light."""
@@ -248,9 +286,9 @@ class Belief:
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
-            due = hidden_knock + (self.priors.unseen_knock if self._began[h] else 0.0)
             for j in range(len(jumps.share)):
-                chance = jumps.share[j] * (1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s))
+                happens = 1.0 - (1.0 - hidden_knock * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
+                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else happens)
                 if chance <= 0.0:
                     continue
                 log = math.log(chance)
@@ -268,6 +306,7 @@ class Belief:
         doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
         prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
         lie_across(nodes, i, self._bank, asked.seen, self._table, self._sizes)
+        look_elsewhere(nodes, i, asked.seen, self._table)
 
     def _keep(self, n: int, asked: Asked) -> float:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates
@@ -283,17 +322,11 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        self._hide(other.doubts[: len(chosen)], parents, asked.seen)
+        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(asked.seen.shown))
+        blind = [shown & ~edges_of(int(of), self._table.edges) == 0 for of in other.doubts[: len(chosen)]]
+        self._blind = np.array(blind, bool)
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
         return float(dropped)
-
-    def _hide(self, doubts: Ints, parents: Ints, seen: Seen) -> None:
-        """Which hypotheses, of sets of ``doubts`` (h,), trust no end that is shown, and which of them since now; of
-        frames that show none, who sees them says so.
-        """
-        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(seen.shown))
-        blind = np.array([shown & ~edges_of(int(of), self._table.edges) == 0 for of in doubts], bool)
-        self._blind, self._began = blind, blind & ~self._blind[parents] & (shown != 0)
 
     def _not_known(self) -> None:
         """Beside what explains nothing: the pose is anywhere a knock may have brought it."""
@@ -308,7 +341,7 @@ class Belief:
         bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
         bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
         self._hypotheses = self._listed = n + 1
-        self._began, self._blind = np.append(self._began[:n], False), np.append(self._blind[:n], self._blind[h])
+        self._blind = np.append(self._blind[:n], self._blind[h])
 
     def _believed(self, dropped: float, surprise: float) -> Believed:
         bank, n, mean = self._bank, self._listed, np.empty(SIZE)

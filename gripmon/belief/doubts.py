@@ -84,8 +84,9 @@ def of_ends(ends_of: Sequence[Flags]) -> list[Doubt]:
 
 
 class Table(NamedTuple):
-    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled``
-    and ``moves`` as bits of doubts, ``at_ends`` as bits of edges.  ``rates`` (d, 5) in the order of :class:`Rates`.
+    """All d doubts: ``edges`` (d,) as bits, ``ends`` (f,) doubts about a finger's ends as bits; ``held``, ``fooled``,
+    ``moves`` and ``all_ends`` as bits of doubts, ``at_ends`` as bits of edges.  ``rates`` (d, 5) in the order of
+    :class:`Rates`.
     """
 
     edges: Ints
@@ -93,6 +94,7 @@ class Table(NamedTuple):
     held: int
     fooled: int
     moves: int
+    all_ends: int
     at_ends: int
     rates: Array
 
@@ -106,7 +108,8 @@ class Table(NamedTuple):
         rates = np.array([astuple(d.rates) for d in doubts])
         return cls(
             np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
-            _bits([d.fooled for d in doubts]), _bits([d.moves for d in doubts]), _bits(at_ends), rates,
+            _bits([d.fooled for d in doubts]), _bits([d.moves for d in doubts]),
+            _bits([bool(d.ends.any() and d.ends.all() and len(d.ends) > 1) for d in doubts]), _bits(at_ends), rates,
         )  # fmt: skip
 
 
@@ -194,13 +197,16 @@ def log_transition(before: int, after: int, chances: Chances) -> float:
 
 
 @compiled
-def log_told(before: int, after: int, table: Table, told: Told, first: bool) -> float:
-    """Log likelihood of the witnesses.  An answer that repeats is little news while what it is about stays."""
+def log_told(before: int, after: int, table: Table, told: Told, first: bool, away: Flags) -> float:
+    """Log likelihood of the witnesses.  An answer that repeats is little news while what it is about stays.  Of fingers
+    whose ends are ``away`` (f,) from where they were looked at, something else was.
+    """
     total, fingers = 0.0, len(table.ends)
     rights, sames, repeats = 0, 0, 0
     for f in range(fingers):
         bad, was = after & table.ends[f], before & table.ends[f]
         right, was_right = bad == 0 or bad & table.fooled != 0, was == 0 or was & table.fooled != 0
+        right, was_right = right and not away[f], was_right and not away[f]
         same = not first and (bad != 0) == (was != 0) and right == was_right
         rights, sames, repeats = rights + int(right), sames + int(same), repeats + int(told.repeats[f])
         total += answered(told.right[f] if right else told.wrong[f], same, told.repeats[f], told.memory)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief.doubts import Table
-from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, normal, root_of, shift_row
+from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, normal, not_drawn, root_of, shift_row
 from gripmon.belief.state import LENGTHS, SIZE, Bank, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
@@ -25,6 +25,8 @@ _FIRST = LENGTHS.start
 APART_PX = 1.0
 """Standard deviation of an edge's place beyond which it doesn't tell lines apart that lie two widths of an edge apart.
 """
+LOOKED_PX = 3.5
+"""How far an end may be from where it was looked at: half of the reach of the search lines."""
 
 
 class Nodes(NamedTuple):
@@ -36,7 +38,8 @@ class Nodes(NamedTuple):
     that are ``joint`` (n, e), another thing that lies near is wherever the gripper is by the others: these have ``far``
     (n, e) instead.  ``across`` (n, d), by how much that of each doubt's edges together is larger since a straight thing
     may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown; ``hope`` (n,),
-    by how much more a place would explain where all edges were on lines, of those that are on none.
+    by how much more a place would explain where all edges were on lines, of those that are on none; ``away`` (n, f):
+    a finger's ends are elsewhere than they were looked at.
     """
 
     parent: Ints
@@ -58,9 +61,10 @@ class Nodes(NamedTuple):
     information: Array
     pull: Array
     hope: Array
+    away: Flags
 
     @classmethod
-    def empty(cls, nodes: int, edges: int, doubts: int) -> Nodes:
+    def empty(cls, nodes: int, edges: int, doubts: int, fingers: int) -> Nodes:
         """Zeros."""
         n, e = nodes, edges
         return cls(
@@ -68,7 +72,7 @@ class Nodes(NamedTuple):
             np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e), np.int64),
             np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
             np.zeros((n, e), bool), np.zeros((n, e)), np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)),
-            np.zeros((n, SIZE)), np.zeros(n),
+            np.zeros((n, SIZE)), np.zeros(n), np.zeros((n, fingers), bool),
         )  # fmt: skip
 
 
@@ -88,11 +92,12 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
     information[:, :] = 0.0
     pull[:] = 0.0
     nodes.hope[i] = 0.0
-    prior, noise, expected = np.empty(2), np.empty(2), np.empty(2)
+    lines = seen.lines.shape[1]
+    noise, expected, known = np.empty(2), np.empty(2), np.empty((2, SIZE))
+    places, spreads, ways = np.empty((lines, 2)), np.empty((lines, 2)), np.empty((lines, 2, SIZE))
     for edge in range(len(seen.found)):
-        for row in range(2):
-            nodes.at[i, edge, row], nodes.wide[i, edge, row] = seen.searched[edge, row], 0.0
         nodes.joint[i, edge] = False
+        nodes.at[i, edge], nodes.wide[i, edge] = seen.searched[edge, 0], 0.0
         nodes.base[i, edge] = nodes.free[i, edge] = nodes.held[i, edge] = 0.0
         if seen.found[edge] == 0:
             continue
@@ -109,40 +114,45 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
                 for j in range(r):
                     for k in range(r):
                         noise[row] += along[j] * between[j, k] * along[k]
-            for j in range(SIZE):
-                line[j] += seen.rows[edge, row, j]
-                expected[row] += line[j] * mean[j]
-            white, prior[row] = nodes.rows[i, edge, row], 0.0
-            for j in range(SIZE):
-                total = 0.0
-                for k in range(j, SIZE):
-                    total += root[k, j] * line[k]
-                white[j] = total
-                prior[row] += total * total
-            nodes.at[i, edge, row], nodes.wide[i, edge, row] = expected[row], prior[row] + noise[row]
-        of, share = which(seen, edge, nodes.at[i, edge], nodes.wide[i, edge], sizes)
+            known[row] = line
+            for of in range(seen.found[edge]):
+                place, prior, way = expected[row], 0.0, ways[of, row]
+                for j in range(SIZE):
+                    line[j] = known[row, j] + seen.rows[edge, of, row, j]
+                    place += line[j] * mean[j]
+                for j in range(SIZE):
+                    total = 0.0
+                    for k in range(j, SIZE):
+                        total += root[k, j] * line[k]
+                    way[j] = total
+                    prior += total * total
+                places[of, row], spreads[of, row] = place, prior + noise[row]
+        of, share = which(seen, edge, places, spreads, sizes)
         nodes.line[i, edge], nodes.base[i, edge] = of, share
+        usual = max(of, 0)
+        nodes.at[i, edge], nodes.wide[i, edge] = places[usual], spreads[usual]
         for row in range(2):
             white = nodes.rows[i, edge, row]
+            variance = noise[row] + seen.white[edge, usual, row]
             if of < 0:
                 white[:] = 0.0
                 nodes.missing[i, edge, row] = 0.0
-                nodes.hope[i] -= 0.5 * math.log(2.0 * math.pi * (noise[row] + seen.white[edge, 0, row]))
+                nodes.hope[i] -= 0.5 * math.log(2.0 * math.pi * variance)
                 continue
-            variance = noise[row] + seen.white[edge, of, row]
             scale = 1.0 / math.sqrt(variance)
             for j in range(SIZE):
-                white[j] *= scale
-            zeta = (seen.lines[edge, of, row] - expected[row]) * scale
+                white[j] = ways[of, row, j] * scale
+            zeta = (seen.lines[edge, of, row] - places[of, row]) * scale
             nodes.missing[i, edge, row], nodes.noise[i, edge, row] = zeta, variance
             nodes.base[i, edge] -= 0.5 * math.log(2.0 * math.pi * variance)
             add_row(information, pull, white, zeta, 1.0)
         if of < 0:
             nodes.hope[i] -= share
-        fresh, at, wide = (doubted >> edge) & 1 == 0, nodes.at[i, edge], nodes.wide[i, edge]
-        apart = wide[0] > APART_PX**2 and seen.fitted[edge]  # then the fit says where its own would be
+        fresh = (doubted >> edge) & 1 == 0 or not_drawn(bank, h, edge)
+        at, wide = nodes.at[i, edge], nodes.wide[i, edge]
+        apart = wide[0] > APART_PX**2 and seen.fitted[edge] >= 0  # then the fit says where its own would be
         if apart:
-            at[:], wide[:] = seen.searched[edge], 0.0
+            at[:], wide[:] = seen.searched[edge, seen.fitted[edge]], 0.0
         nodes.joint[i, edge] = fresh and apart
         nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
         nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, True, False)
@@ -152,9 +162,10 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
 
 
 @compiled
-def which(seen: Seen, edge: int, at: Array, wide: Array, sizes: Array) -> tuple[int, float]:
-    """The line there that an edge of the gripper is taken for, expected ``at`` (2,) with variance ``wide`` (2,), and
-    the log probability of that; or that of its being none of them, with what these say as anything's.
+def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) -> tuple[int, float]:
+    """The line there that an edge of the gripper is taken for, by each line's rows expected at ``places`` (l, 2) with
+    variances ``spreads`` (l, 2), and the log probability of that; or that of its being none of them, with what these
+    say as anything's.
 
     Where it is known to less than lines lie apart, the fit chooses, as for all edges together.
     """
@@ -164,15 +175,15 @@ def which(seen: Seen, edge: int, at: Array, wide: Array, sizes: Array) -> tuple[
         near, anything = 0.0, 0.0
         for row in range(2):
             value, white = seen.lines[edge, of, row], seen.white[edge, of, row]
-            near += normal(value - at[row], wide[row] + white)
-            anything += normal(value - seen.searched[edge, row], far + white)
+            near += normal(value - places[of, row], spreads[of, row] + white)
+            anything += normal(value - seen.searched[edge, of, row], far + white)
         any_of += math.exp(anything) / count
         if near > most:
             best, most = of, near
-    none = math.log(missed) + math.log(any_of) if missed > 0.0 else -math.inf
-    if wide[0] > APART_PX**2 and seen.fitted[edge]:
-        return 0, math.log(1.0 - missed) + log
-    if missed > 0.0 and (wide[0] > APART_PX**2 or math.log(1.0 - missed) + log + most < none):
+    none, apart = math.log(missed) + math.log(any_of) if missed > 0.0 else -math.inf, spreads[0, 0] > APART_PX**2
+    if apart and seen.fitted[edge] >= 0:
+        return seen.fitted[edge], math.log(1.0 - missed) + log
+    if missed > 0.0 and (apart or math.log(1.0 - missed) + log + most < none):
         return -1, none
     return best, math.log(1.0 - missed) + log
 
@@ -191,15 +202,17 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
             of_ends = of_ends or (table.ends[finger] >> k) & 1 == 1
         if not of_ends:
             continue
-        log, apart, cross, along, rows = 0.0, 0.0, 0.0, 0.0, 0
+        log, apart, cross, along, rows, fresh = 0.0, 0.0, 0.0, 0.0, 0, (before >> k) & 1 == 0
         for edge in range(len(seen.found)):
             if not ((table.edges[k] >> edge) & 1 and seen.found[edge] > 0):
                 continue
             apart += nodes.held[i, edge]
+            fresh = fresh or not_drawn(bank, nodes.parent[i], edge)
+            of = max(seen.fitted[edge], 0)
             for row in range(2):
-                way = seen.rows[edge, row, _FIRST] + seen.rows[edge, row, _FIRST + 1]
-                missing = seen.lines[edge, 0, row] - nodes.at[i, edge, row]
-                variance = near + nodes.wide[i, edge, row] + seen.strength[edge] + seen.white[edge, 0, row]
+                way = seen.rows[edge, of, row, _FIRST] + seen.rows[edge, of, row, _FIRST + 1]
+                missing = seen.lines[edge, of, row] - nodes.at[i, edge, row]
+                variance = near + nodes.wide[i, edge, row] + seen.strength[edge] + seen.white[edge, of, row]
                 log += normal(missing, variance)
                 cross += way * missing / variance
                 along += way * way / variance
@@ -207,9 +220,24 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
         if rows < 4 or along == 0.0:
             continue
         log += 0.5 * (across * cross * cross / (1.0 + across * along) - math.log(1.0 + across * along))
-        share_now = share if (before >> k) & 1 == 0 else another * share
+        share_now = share if fresh else another * share
         if share_now > 0.0:
             nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + log - apart)
+
+
+@compiled
+def look_elsewhere(nodes: Nodes, i: int, seen: Seen, table: Table) -> None:
+    """Whether the witnesses looked at this node's ends: within the width of what an end's probes cover."""
+    for finger in range(len(table.ends)):
+        nodes.away[i, finger] = False
+        for k in range(len(table.edges)):
+            if (table.ends[finger] >> k) & 1 == 0 or (table.all_ends >> k) & 1:
+                continue
+            for edge in range(len(seen.found)):
+                if (table.edges[k] >> edge) & 1 and seen.found[edge] > 0:
+                    off = nodes.at[i, edge, 0] - seen.asked[edge, 0]
+                    if abs(off) > LOOKED_PX:
+                        nodes.away[i, finger] = True
 
 
 @compiled

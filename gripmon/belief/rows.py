@@ -182,7 +182,7 @@ def learn(bank: Bank, h: int, seen: Seen, edge: int, of: int) -> None:
         variance = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s] + seen.white[edge, of, row]
         missing = seen.lines[edge, of, row] - offset[0] - offset[s]
         for i in range(SIZE):
-            line[i] = seen.rows[edge, row, i] + slope[0, i] + slope[s, i]
+            line[i] = seen.rows[edge, of, row, i] + slope[0, i] + slope[s, i]
         for k in range(states):
             gain[k] = spread[k, 0] + spread[k, s]
         for k in range(states):
@@ -207,19 +207,27 @@ def normal(missing: float, variance: float) -> float:
 
 
 @compiled
-def drawn(place: Array, spread: Array, missing: float, white: float) -> float:
+def drawn(place: Array, spread: Array, missing: float, white: float, own: float) -> float:
     """Log likelihood of one row, ``missing`` px from where it was searched, whose ``place`` (2,) (place, background)
-    with its variances and covariance ``spread`` (3,) learns from it.
+    with its variances and covariance ``spread`` (3,) learns from it.  It is known with variance ``white`` there, and
+    ``own`` where the gripper's own are: as a density of the same number as theirs.
     """
     missing -= place[0] + place[1]
-    variance = spread[0] + 2.0 * spread[1] + spread[2] + white
+    known = spread[0] + 2.0 * spread[1] + spread[2]
+    variance = known + white
     of_place, of_back = (spread[0] + spread[1]) / variance, (spread[1] + spread[2]) / variance
     place[0] += of_place * missing
     place[1] += of_back * missing
     spread[0] -= of_place * of_place * variance
     spread[1] -= of_place * of_back * variance
     spread[2] -= of_back * of_back * variance
-    return normal(missing, variance)
+    return -0.5 * (missing * missing / variance + math.log(2.0 * math.pi * (known + own)))
+
+
+@compiled
+def not_drawn(bank: Bank, h: int, edge: int) -> bool:
+    """Whether nothing was seen of another thing's edge since the doubt began."""
+    return bank.place_spread[h, edge, 0, 0, 0] == 0.0
 
 
 @compiled
@@ -232,10 +240,17 @@ def foreign(
 
     It lies near where the gripper's own is expected, ``at`` (2,) with variance ``wide`` (2,), or anywhere around where
     it was searched, is any of the lines there, and stays there while the picture does; ``held`` moves with the gripper
-    and stays in any case.  ``fresh``: the doubt begins.  ``near``: it may be near.  ``keep``: it is learnt, and what
-    wasn't shown fades.
+    and stays in any case.  ``fresh``: the doubt begins; of one that begins while nothing is shown the place is drawn
+    when something is.  ``near``: it may be near.  ``keep``: it is learnt, and what wasn't shown fades.
     """
     count, strength = seen.found[edge], seen.strength[edge]
+    if count == 0 and fresh:
+        for kind in range(FOREIGN_KINDS if keep else 0):
+            bank.place_spread[h, edge, kind, :, :] = 0.0
+        return 0.0
+    fresh = fresh or not_drawn(bank, h, edge)
+    if count == 0 and fresh:
+        return 0.0
     like = seen.likeness[edge] if count > 0 else 1.0
     stays = 1.0 if held or like >= STILL else like
     another = 1.0 if fresh else sizes[2] if count > 0 else 0.0
@@ -243,14 +258,17 @@ def foreign(
     best, best_spread = np.zeros((2, 2)), np.zeros((2, 3))
     for kind in range(FOREIGN_KINDS):
         most, total = -math.inf, -math.inf
-        again = False
+        drawn_at = -1
         for way in range(2):  # it stays, or is drawn
             share = math.log(max(another if way == 1 else 1.0 - another, 1e-300))
             for of in range(max(count, 1)):
                 log = share - math.log(max(count, 1))
                 for row in range(2):
-                    around = bank.searched[h, edge, kind, row]
+                    missing, white, own = 0.0, seen.white[edge, of, row], seen.white[edge, of, row]
                     if way == 0:
+                        white = seen.image_white[edge, of, row]
+                        if count > 0:
+                            missing = seen.image[edge, of, row] - bank.searched[h, edge, kind, row]
                         was = bank.place_spread[h, edge, kind, row]
                         place[row, 0] = stays * bank.place[h, edge, kind, row, 0]
                         place[row, 1] = like * bank.place[h, edge, kind, row, 1]
@@ -258,23 +276,23 @@ def foreign(
                         spread[row, 1] = stays * like * was[1]
                         spread[row, 2] = like * like * was[2] + (1.0 - like * like) * strength
                     else:
-                        around = seen.searched[edge, row]
+                        missing = seen.lines[edge, of, row] - seen.searched[edge, of, row]
                         place[row, 0], place[row, 1] = 0.0, 0.0
                         spread[row, 0], spread[row, 1], spread[row, 2] = sizes[kind], 0.0, strength
                         if kind == NEAR:
-                            place[row, 0] = at[row] - around
+                            place[row, 0] = at[row] - seen.searched[edge, of, row]
                             spread[row, 0] += wide[row]
                     if count > 0:
-                        missing = seen.lines[edge, of, row] - around
-                        log += drawn(place[row], spread[row], missing, seen.white[edge, of, row])
+                        log += drawn(place[row], spread[row], missing, white, own)
                 total = log if total == -math.inf else log_sum(total, log)
                 if log > most:
-                    most, again = log, way == 1
+                    most, drawn_at = log, of if way == 1 else -1
                     best[:, :], best_spread[:, :] = place, spread
         logs[kind] = (-math.log(2.0) if fresh else bank.kind[h, edge, kind]) + total
         for row in range(2 if keep else 0):
-            if again:
-                bank.searched[h, edge, kind, row] = seen.searched[edge, row]
+            if drawn_at >= 0:
+                beside = seen.lines[edge, drawn_at, row] - seen.searched[edge, drawn_at, row]
+                bank.searched[h, edge, kind, row] = seen.image[edge, drawn_at, row] - beside
             for k in range(2):
                 bank.place[h, edge, kind, row, k] = best[row, k]
             for k in range(3):

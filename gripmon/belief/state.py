@@ -65,8 +65,8 @@ class Priors:
     second's square root while it is loose.
     ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
     standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability each time that
-    all ends begin to be doubted (policy: what hides them is what knocks).  ``opening_per_s``: the reported opening is
-    wrong by ``opening_jump_m``.
+    all ends begin to be doubted (policy: what hides them is what knocks).  ``opening_first``, ``opening_per_s``: the
+    reported opening is wrong by ``opening_jump_m``, at first and later.
     """
 
     reference: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2)
@@ -92,6 +92,7 @@ class Priors:
     knock_rad: float = 20e-3
     along_share: float = 1.0 / 3.0
     along: tuple[tuple[float, float], ...] = ((1.7e-3, 0.35), (3.8e-3, 0.45), (8.5e-3, 0.20))
+    opening_first: float = 1e-3
     opening_per_s: float = 1e-6
     opening_jump_m: float = 3e-3
 
@@ -134,23 +135,28 @@ class Bank(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """A frame's edges.  ``rows`` (e, 2, 23): how offset at the middle and slope times half the length, px, change with
-    g (zero for p).  Of the lines that were found where an edge was searched, ``found`` (e,) of them, ``lines`` (e, l,
-    2) offset and slope, and ``white`` (e, l, 2), the variance of what is new in every frame, px^2; ``fitted`` (e,): the
-    first is the one that agrees with the fit.  ``background`` (e,), the remembered one that is behind the edge now;
-    ``likeness`` (e,) of it to when it was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's
-    error, px^2; ``searched`` (e, 2), where the edges were looked for, px.
+    """A frame's edges.  Of the lines that were found where an edge was searched, ``found`` (e,) of them: ``rows`` (e,
+    l, 2, 23), how offset at the middle and slope times half the length, px, change with g (zero for p), ``lines`` (e,
+    l, 2) both, ``white`` (e, l, 2), the variance of what is new in every frame, px^2, ``searched`` (e, l, 2), where the
+    edge was looked for, px, and ``image`` (e, l, 2), both numbers in a frame of the edge's own that is fixed in the
+    image, whatever place the rows are for, with ``image_white``; ``fitted`` (e,): which of them agrees with the fit, -1
+    for none.  ``background`` (e,), the remembered one that is behind the edge now; ``likeness`` (e,) of it to when it
+    was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2; ``asked`` (e, 2), px,
+    where it was looked whether ends are ends.
     """
 
     rows: Array
     lines: Array
     white: Array
+    searched: Array
+    image: Array
+    image_white: Array
     found: Ints
-    fitted: Flags
+    fitted: Ints
     background: Ints
     likeness: Array
     strength: Array
-    searched: Array
+    asked: Array
 
     @property
     def shown(self) -> Flags:

@@ -12,26 +12,22 @@ import numpy as np
 
 from gripmon.belief.core import Belief, Believed
 from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
-from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, OPENING, REFERENCE, SIZE, Flags, Ints, Priors, Seen
+from gripmon.belief.nodes import LOOKED_PX
+from gripmon.belief.state import FOCAL, LENGTHS, MOTION, OPENING, REFERENCE, SIZE, Flags, Priors, Seen
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.poses import perturbation_between
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.monitor.edge_lines import Frame2d, found_at, merged
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
 from gripmon.track.edges.profiles import read_profiles
 
-FEWEST_POINTS = 6
-"""Points of an edge from which it has an offset and a slope with a scatter."""
-LEAST_WHITE_PX = 0.02
-"""Standard deviation of an edge that no pixel noise explains: interpolation between pixels."""
-MOST_LINES = 3
-WITHIN_PX = 0.6
-"""Distance from a line within which an edgel hypothesis is on it: three standard deviations of the least sure ones."""
-PLACES_PX = np.array([(offset, slope) for offset in np.arange(-7.0, 7.01, 0.3) for slope in np.arange(-2.0, 2.01, 0.5)])
-"""Where lines are looked for (offset, slope): as far as search lines reach."""
+MOST_PLACES = 3
+SETTLES_M, SETTLES_RAD = 0.3e-3, 3e-3
+"""How far a fit goes from a place at which it starts, beside what isn't known of that: that of a small motion."""
 BESIDE_PX, BESIDE_POINTS = 6.0, 12
 """Distance from an edge of the pixels beside it that are compared, clear of its blur, and how many a side."""
 TEXTURE_PX = 0.34 * math.sqrt(40.0)
@@ -79,6 +75,7 @@ class Shadow:
             risk=settings.policy.integrity_risk, most=most, covariance=covariance,
         )  # fmt: skip
         self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, when it was seen last
+        self._frames: dict[int, Frame2d] = {}
         self._last_s: float | None = None
         self._jaw_m: float | None = None
         self._answer = np.full(len(self._ends_of), -1)
@@ -93,10 +90,13 @@ class Shadow:
     def see(self, frame: Frame, measurement: Measurement, now_s: float) -> None:
         """A frame of the monitor's, measured."""
         self.newest = None
-        seen = self._seen(frame, measurement)
-        if seen is None or (self._last_s is not None and now_s <= self._last_s):
+        if self._last_s is not None and now_s <= self._last_s:
             return
-        ends = self._tracker.ends(frame, measurement)
+        looks = self._looks(frame, measurement)
+        seen = self._seen(frame, looks, measurement)
+        if seen is None:
+            return
+        ends = self._tracker.ends(frame, looks[0])
         ends_shown = bool(np.any([seen.shown & own for own in self._ends_of]))
         hidden, self._hidden = not ends_shown and not self._hidden, not ends_shown
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
@@ -127,54 +127,58 @@ class Shadow:
         repeats, self._answer = (answer == self._answer) & (answer >= 0), answer
         return Told(right, wrong, repeats, REPEATS, together)
 
-    def _seen(self, frame: Frame, measurement: Measurement) -> Seen | None:
-        """The frame's edges; None with too few of them."""
-        p, c, fit = measurement.prediction, measurement.candidates, measurement.consensus
-        edges = len(self._gripper.edge_ids)
-        rows, lines = np.zeros((edges, 2, SIZE)), np.zeros((edges, MOST_LINES, 2))
-        white, count = np.ones((edges, MOST_LINES, 2)), np.zeros(edges, np.int64)
-        searched, fitted, strength = np.zeros((edges, 2)), np.zeros(edges, bool), np.full(edges, 1.0)
-        assert isinstance(frame.image, np.ndarray)
-        beside, noise = _beside(frame.image, measurement, edges), c.noise / math.sqrt(3.0)  # of three pixels' mean
-        at = self._columns(measurement)
-        away = perturbation_between(self._ref_T, p.cam_T_grip)
-        reported_m = self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
-        from_reference = at[:, MOTION] @ away + at[:, OPENING] * (p.jaw_opening_m - reported_m)
-        edge_of = p.layout.edge[c.sample]
-        for edge in measurement.normal.edge:
-            own = np.flatnonzero(edge_of == edge)
-            agree = fit.weight[own] > 0.0 if fit.edge_seen[edge] else np.zeros(len(own), bool)
-            search_lines = int(np.count_nonzero(p.layout.edge == edge))
-            found = lines_of(c.offset_px[own], c.sample[own], p.layout.fraction[c.sample[own]], agree, search_lines)
-            if not found:
+    def _looks(self, frame: Frame, measurement: Measurement) -> list[Measurement]:
+        """The frame as the rules' fit measured it, and at the heaviest places that this isn't near to: what isn't
+        looked for isn't found.  The first is that at the heaviest.
+        """
+        looks, main = [measurement], 0
+        for k, (mean, covariance) in enumerate(self._belief.places[:MOST_PLACES]):
+            cam_T_grip = perturb(self._ref_T, mean[MOTION] + mean[REFERENCE])
+            if any(_near(look, cam_T_grip) for look in looks):
                 continue
-            first = own[found[0]]
-            fraction = p.layout.fraction[c.sample[first]]
-            line = _line(_basis(fraction, fraction), 1.0 / np.square(c.sigma_px[first]))
-            all_of = line @ np.column_stack([from_reference[c.sample[first]], at[c.sample[first]]])
-            searched[edge], rows[edge] = all_of[:, 0], all_of[:, 1:]
-            for k, on in enumerate(found):
-                points = own[on]
-                basis = _basis(p.layout.fraction[c.sample[points]], fraction)
-                lines[edge, k] = _line(basis, 1.0 / np.square(c.sigma_px[points])) @ c.offset_px[points]
-                left = c.offset_px[points] - basis @ lines[edge, k]
-                spread = float(left @ left) / max(len(points) - 2, 1)
-                single = np.diag(np.linalg.inv(basis.T @ basis)) / float(p.independence[edge])
-                white[edge, k] = LEAST_WHITE_PX**2 + spread * single
-                lines[edge, k] += searched[edge]
-            count[edge], fitted[edge] = len(found), found[0] is agree
-            step = float(np.median(c.step[first]))
-            texture = _texture(beside, int(edge), noise)
-            strength[edge] = (TEXTURE_PX * texture / max(abs(step), 1.0)) ** 2 / max(
-                float(p.independence[edge]) * len(first), 2.0
-            )
-            rows[edge, 0, LIGHT], rows[edge, 1, LIGHT] = -np.sign(step), 0.0
+            both = covariance[MOTION, MOTION] + covariance[REFERENCE, REFERENCE]
+            sigma = np.sqrt(np.diag(both) + np.repeat([SETTLES_M**2, SETTLES_RAD**2], 3))
+            main = len(looks) if k == 0 else main
+            looks.append(self._tracker.measure_held(frame, cam_T_grip, sigma))
+        return [looks[main], *looks[:main], *looks[main + 1 :]]
+
+    def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
+        """The frame's edges, of several looks at it; None with too few of them."""
+        main, edges = looks[0], len(self._gripper.edge_ids)
+        assert isinstance(frame.image, np.ndarray)
+        beside, noise = _beside(frame.image, main, edges), main.candidates.noise / math.sqrt(3.0)  # of three pixels
+        reported_m = self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
+        away = [perturbation_between(self._ref_T, look.prediction.cam_T_grip) for look in looks]
+        found = [
+            found_at(look, self._columns(look), at, reported_m, self._frames)
+            for look, at in zip(looks, away, strict=True)
+        ]
+        by = next(k for k, look in enumerate(looks) if look is fit)
+        all_lines = [merged([of[edge] for of in found], by) for edge in range(edges)]
+        most = max(1, max(len(of) for of, _ in all_lines))
+        rows, (white, image_white) = np.zeros((edges, most, 2, SIZE)), np.ones((2, edges, most, 2))
+        lines, searched, image = np.zeros((3, edges, most, 2))
+        strength, fitted, asked = np.full(edges, 1.0), np.full(edges, -1), np.zeros((edges, 2))
+        for edge, (of, by_fit) in enumerate(all_lines):
+            fitted[edge] = by_fit
+            for k, line in enumerate(of):
+                rows[edge, k], lines[edge, k], white[edge, k] = line.rows, line.place_px, line.white_px2
+                searched[edge, k], image[edge, k] = line.searched_px, line.image_px
+                image_white[edge, k] = line.image_px2
+            if of:
+                texture = TEXTURE_PX * _texture(beside, edge, noise)
+                strength[edge] = (texture / max(abs(of[0].step), 1.0)) ** 2 / of[0].points
+                asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
+        count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0
         if np.count_nonzero(shown) < 3:
             return None
         likeness = np.array([_likeness(beside[e], self._beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         self._beside = np.where(shown[:, None, None], beside, self._beside)
-        return Seen(rows, lines, white, count, fitted, np.zeros(edges, np.int64), likeness, strength, searched)
+        background = np.zeros(edges, np.int64)
+        return Seen(
+            rows, lines, white, searched, image, image_white, count, fitted, background, likeness, strength, asked
+        )  # fmt: skip
 
     def _columns(self, measurement: Measurement) -> Array:
         """(n, 23): how each search line's offset changes with g, at the present pose."""
@@ -192,6 +196,16 @@ class Shadow:
         return out
 
 
+def _near(look: Measurement, cam_T_grip: Array) -> bool:
+    """Whether a place's edges were all well within the search lines of a look."""
+    there = look.prediction
+    return there.moved_px(_wide_as(there.jacobian, perturbation_between(there.cam_T_grip, cam_T_grip))) < LOOKED_PX
+
+
+def _wide_as(jacobian: Array, motion: Array) -> Array:
+    return np.concatenate([motion, np.zeros(jacobian.shape[1] - len(motion))])
+
+
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
     """What may be wrong with a gripper's edges."""
     edges, fingers = len(gripper.edge_ids), len(gripper.finger_ids)
@@ -207,54 +221,6 @@ def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doub
             taken.add(flags.tobytes())
             out.append(Doubt(np.asarray(flags, bool), rates, nobody))
     return out
-
-
-def lines_of(offset_px: Array, sample: Ints, fraction: Array, agree: Flags, search_lines: int) -> list[Flags]:
-    """Which of an edge's edgel hypotheses (n,), at ``offset_px`` on ``sample``, the search line at ``fraction`` of the
-    edge, are on each of the lines there, at most MOST_LINES: first that of those which ``agree`` with the fit, if there
-    are enough, then what at least half of the ``search_lines`` support.
-    """
-    out: list[Flags] = []
-    left, basis = np.ones(len(offset_px), bool), _basis(fraction, fraction)
-
-    def take(on: Flags) -> None:
-        nonlocal left
-        place = np.linalg.lstsq(basis[on], offset_px[on], rcond=None)[0]
-        left = left & (np.abs(offset_px - basis @ place) > 2.0 * WITHIN_PX)
-        out.append(on)
-
-    if len(np.unique(sample[agree])) >= FEWEST_POINTS:
-        take(agree)
-    least = max(FEWEST_POINTS, 0.5 * search_lines)
-    while len(out) < MOST_LINES and len(np.unique(sample[left])) >= least:
-        among = np.flatnonzero(left)
-        hit = np.abs(offset_px[among, None] - basis[among] @ PLACES_PX.T) < WITHIN_PX
-        first = np.concatenate([[0], np.flatnonzero(np.diff(sample[among])) + 1])
-        votes = np.logical_or.reduceat(hit, first, axis=0).sum(axis=0)
-        place = PLACES_PX[int(np.argmax(votes))]
-        if votes.max() < least:
-            break
-        for _ in range(2):
-            on = left & (np.abs(offset_px - basis @ place) < WITHIN_PX)
-            if np.ptp(fraction[on]) == 0.0:
-                return out
-            place = np.linalg.lstsq(basis[on], offset_px[on], rcond=None)[0]
-        if len(np.unique(sample[on])) < FEWEST_POINTS:
-            break
-        take(on)
-    return out
-
-
-def _basis(fraction: Array, along: Array) -> Array:
-    """(n, 2): one, and the way along an edge, -1 to 1 from the first to the last of ``along`` (s,)."""
-    middle, half = 0.5 * (along.min() + along.max()), 0.5 * (along.max() - along.min())
-    return np.column_stack([np.ones(len(fraction)), (fraction - middle) / max(half, 1e-9)])
-
-
-def _line(basis: Array, weight: Array) -> Array:
-    """(2, n): from values along an edge to their offset at its middle and slope times half its length, weighted."""
-    weighted = basis.T * weight
-    return np.asarray(np.linalg.solve(weighted @ basis, weighted))
 
 
 def _beside(image: Image, measurement: Measurement, edges: int) -> Array:

@@ -145,7 +145,7 @@ def _own(frames: Sequence[Told], bad: Array, end: int) -> list[At]:
 
 
 def _rows(frames: Sequence[Told], at: Sequence[At]) -> Array:
-    return np.array([frames[t].seen.rows[e, r] for t, e, r in at])
+    return np.array([frames[t].seen.rows[e, 0, r] for t, e, r in at])
 
 
 def _noise(priors: Priors, frames: Sequence[Told], at: Sequence[At], others: Sequence[At]) -> Array:
@@ -184,16 +184,17 @@ def _stretch(
     shown = [t for t in range(start, end) if frames[t].seen.shown[edge]]
     if not shown:
         return 0.0
-    seen, parts = frames[start].seen, []
+    first, parts = shown[0], []  # of a doubt that begins unseen the place is drawn when it is seen
+    seen = frames[first].seen
     for near, size in ((True, priors.near_px), (False, priors.far_px)):
         part = math.log(0.5)
         for r in (0, 1):
             away, wide = 0.0, 0.0  # where it is drawn beside where it was searched
-            if near and seen.shown[edge]:
-                place, wide = _expected(priors, frames, bad, (start, edge, r))
-                away = place - float(seen.searched[edge, r])
-            left = [_faded(frames, edge, start, t, held) for t in shown]
-            values = [float(frames[t].seen.lines[edge, 0, r] - seen.searched[edge, r]) for t in shown]
+            if near:
+                place, wide = _expected(priors, frames, bad, (first, edge, r))
+                away = place - float(seen.searched[edge, 0, r])
+            left = [_faded(frames, edge, first, t, held) for t in shown]
+            values = [float(frames[t].seen.lines[edge, 0, r] - seen.searched[edge, 0, r]) for t in shown]
             covariance = np.array([[
                 size**2 * _faded(frames, edge, i, j, held) + wide * left[a] * left[b]
                 + float(frames[i].seen.strength[edge]) * _faded(frames, edge, i, j)

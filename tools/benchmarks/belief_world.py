@@ -207,14 +207,16 @@ class World:
                 shown &= ~self.view.doubts[i].edges
         where = np.where(foreign[:, None], self._around + self._place, own + self._lasting)
         lines, count, fitted = self._lines(where + self._back + self._noise(WHITE_PX, edges), shown, own)
+        rows, searched = (of[:, None].repeat(2, axis=1) for of in (self.view.rows, own))
+        white = np.full(lines.shape, WHITE_PX**2)
         seen = Seen(
-            self.view.rows, lines, np.full(lines.shape, WHITE_PX**2), count, fitted, np.zeros(edges, np.int64),
-            self._told_likeness(like), np.full(edges, BACKGROUND_PX**2), own,
+            rows, lines, white, searched, lines, white, count, fitted,
+            np.zeros(edges, np.int64), self._told_likeness(like), np.full(edges, BACKGROUND_PX**2), own,
         )  # fmt: skip
         return Sample(seen, self._witnesses(first), light, self._g[MOTION].copy(), self._on.copy())
 
-    def _lines(self, measured: Array, shown: Flags, own: Array) -> tuple[Array, NDArray[np.int64], Flags]:
-        """Lines (e, 2, 2) where edges were searched, how many (e,), and whether the first is the fit's (e,): what is
+    def _lines(self, measured: Array, shown: Flags, own: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+        """Lines (e, 2, 2) where edges were searched, how many (e,), and which is the fit's, -1 for none (e,): what is
         there and now and then another beside it, or only that.
         """
         rng, priors, edges = self._rng, self._priors, len(shown)
@@ -223,7 +225,7 @@ class World:
         missed = rng.random(edges) < priors.missed
         lines[missed, 0] = other[missed]
         two = shown & ~missed & (rng.random(edges) < OTHERS)
-        return lines, np.where(two, 2, np.where(shown, 1, 0)), shown & ~missed
+        return lines, np.where(two, 2, np.where(shown, 1, 0)), np.where(shown & ~missed, 0, -1)
 
     def _told_likeness(self, like: Array) -> Array:
         if "likeness" not in self._differs or self._t == 0:
