@@ -411,7 +411,7 @@ def test_a_mount_that_creeps_fast_is_followed_as_one_that_is_loose() -> None:
             off.append(np.linalg.norm((believed.motion - motion)[:3]))
             assert off[-1] < believed.bound.position_m < 1e-4
         off_m[len(doubts)], loose[len(doubts)] = np.mean(off), sum(w for d, w in belief.weights.items() if d >> 8 & 1)
-    assert loose[9] > 0.99
+    assert loose[9] > 0.9
     assert off_m[9] < 0.6 * off_m[8]
 
 
