@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from support.by_numpy import integrity as by_numpy
@@ -187,6 +189,62 @@ def test_what_has_no_root_is_inverted_all_the_same():
     for found, expected in zip(one[:2], other[:2], strict=True):
         agree(found, expected)
     np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
+
+
+def fractions(numbers: np.ndarray) -> np.ndarray:
+    """The same numbers, of which arithmetic then loses no digit."""
+    return np.vectorize(Fraction, otypes=[object])(numbers)
+
+
+def inverted(matrix: np.ndarray) -> np.ndarray:
+    """Of positive definite fractions (m, m), by elimination."""
+    m = len(matrix)
+    rows = np.hstack([matrix, fractions(np.eye(m))])
+    for i in range(m):
+        rows[i] /= rows[i, i]
+        others = np.arange(m) != i
+        rows[others] -= np.outer(rows[others, i], rows[i])
+    return rows[:, m:]
+
+
+def tells(found: Separation, information: np.ndarray, pull: np.ndarray) -> None:
+    """A pose and its covariance, (1, 6) and (1, 6, 6), are those of fractions, in every direction's own sigma."""
+    covariance, white = inverted(information), np.linalg.cholesky(information.astype(float)).T
+    spread = white @ (fractions(found.covariance[0]) - covariance).astype(float) @ white.T
+    away = white @ (fractions(found.shift[0]) - covariance @ pull).astype(float)
+    assert np.abs(spread).max() < 1e-2 and np.abs(away).max() < 1e-2
+
+
+@pytest.mark.parametrize(("open_m", "open_rad"), [(0.1, 1.0), (1.0, 10.0)])
+@pytest.mark.parametrize("seen", [1, 2, 4])
+def test_directions_that_stay_open_take_no_digits_from_the_others(seen: int, open_m: float, open_rad: float):
+    """All frames show nearly the same few directions, to some micrometres, as under a hypothesis that keeps few edges.
+    Their variances had become negative, and after some frames endless.
+    """
+    rng = np.random.default_rng(7)
+    open_normal = np.diag(np.repeat([open_m, open_rad], 3) ** -2.0)
+    directions, none = rng.normal(size=(seen, 6)) / 5e-6, np.zeros((1, 1, 6))
+    information, pull, average = fractions(np.zeros((6, 6))), fractions(np.zeros(6)), None
+    for _ in range(100):
+        rows = directions * (1.0 + 1e-3 * rng.normal(size=directions.shape))
+        normal, sums = rows.T @ rows + open_normal, rng.normal(size=seen) @ rows
+        information, pull = information + fractions(normal), pull + fractions(sums)
+        fit = Separation(*kernel.separate(sums[None], normal[None], normal[None], none, 6))
+        average = fit if average is None else Separation(*kernel.follow(*average, *fit, np.zeros(6))[:3])
+    tells(average, information, pull)
+    place = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+    joined = Separation(*kernel.with_known(*fit, np.zeros(6), place))
+    tells(joined, fractions(normal) + inverted(fractions(place)), fractions(sums))
+    assert (np.diag(joined.covariance[0]) <= np.minimum(np.diag(place), np.diag(fit.covariance[0]))).all()
+
+
+def test_a_pose_that_is_open_takes_nothing_whichever_comes_first():
+    rng = np.random.default_rng(8)
+    known, shift = fits(rng), 10.0 * shifts(rng, HYPOTHESES)
+    nothing = Separation(shift, np.tile(1e6 * np.eye(6), (HYPOTHESES, 1, 1)), of_the_model(rng, HYPOTHESES))
+    for one, other in ((known, nothing), (nothing, known)):
+        *found, _ = kernel.follow(*one, *other, np.zeros(6))
+        agree(tuple(found), known)
 
 
 def test_what_determines_nothing_is_an_error():

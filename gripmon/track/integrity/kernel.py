@@ -39,10 +39,12 @@ def _root(matrix: Array, root: Array) -> bool:
 
 @compiled
 def _invert(root: Array, inverse: Array, upper: Array) -> None:
-    """``inverse`` (m, m) of the matrix that has the ``root``; ``upper`` (m, m) for what is between."""
+    """``inverse`` (m, m) of the matrix that has the ``root``, and its root: U U' of ``upper`` U (m, m)."""
     m = len(root)
     for j in range(m):
         upper[j, j] = root[j, j]
+        for i in range(j):
+            upper[j, i] = 0.0
         for i in range(j + 1, m):
             total = 0.0
             for k in range(j, i):
@@ -57,17 +59,18 @@ def _invert(root: Array, inverse: Array, upper: Array) -> None:
 
 
 @compiled
-def _inverse(matrix: Array, inverse: Array, root: Array, between: Array) -> None:
-    """``inverse`` of a symmetric matrix, (m, m) each: by Cholesky's root, by elimination where rounding has left none.
-    LinAlgError for a singular one.
+def _inverse(matrix: Array, inverse: Array, root: Array, upper: Array) -> bool:
+    """``inverse`` of a symmetric matrix, (m, m) each: by Cholesky's root, as :func:`_invert`; False, and ``upper`` the
+    inverse, too, where rounding has left none, by elimination.  LinAlgError for a singular one.
     """
     if _root(matrix, root):
-        _invert(root, inverse, between)
-    else:
-        inverted = np.linalg.inv(matrix)
-        for i in range(len(inverted)):
-            for k in range(len(inverted)):
-                inverse[i, k] = inverted[i, k]
+        _invert(root, inverse, upper)
+        return True
+    inverted = np.linalg.inv(matrix)
+    for i in range(len(inverted)):
+        for k in range(len(inverted)):
+            inverse[i, k] = upper[i, k] = inverted[i, k]
+    return False
 
 
 @compiled
@@ -127,28 +130,50 @@ def add_up(
 
 
 @compiled
+def _around(matrix: Array, middle: Array, half: Array, out: Array) -> None:
+    """``out`` = A' B A of a ``matrix`` A and a symmetric ``middle`` B, (m, m) each; ``half`` is overwritten."""
+    m = len(matrix)
+    for i in range(m):
+        for j in range(m):
+            half[i, j] = 0.0
+            for k in range(m):
+                half[i, j] += matrix[k, i] * middle[k, j]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(m):
+                total += half[i, k] * matrix[k, j]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
 def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int) -> tuple[Array, Array, Array]:
     """The fits from their sums, N^-1 of the normal matrices N being the first n = ``unknowns`` rows of their inverses:
     shift N^-1 pull (h, n), covariance N^-1 spread N^-1 (h, n, n), and error by the model N^-1 of_model (h, f, n).
     """
     (count, m), n, fingers = sums.shape, unknowns, of_model.shape[1]
     shift, covariance, off = np.zeros((count, n)), np.empty((count, n, n)), np.zeros((count, fingers, n))
-    root, inverse, between = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
+    inverse, root, upper = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
     for h in range(count):
-        _inverse(normal[h], inverse, root, between)
+        rooted = _inverse(normal[h], inverse, root, upper)
         for i in range(n):
             for j in range(m):
                 shift[h, i] += inverse[i, j] * sums[h, j]
                 for f in range(fingers):
                     off[h, f, i] += inverse[i, j] * of_model[h, f, j]
-                total = 0.0
+        # U (U' spread U) U': multiplied by N^-1 itself, an open direction takes the digits of all others.
+        middle, half = spread[h], root
+        if rooted:
+            _around(upper, spread[h], half, inverse)
+            middle = inverse
+        for i in range(n):
+            for j in range(m):
+                half[i, j] = 0.0
                 for k in range(m):
-                    total += inverse[i, k] * spread[h, k, j]
-                between[i, j] = total
+                    half[i, j] += upper[i, k] * middle[k, j]
             for j in range(i + 1):
                 total = 0.0
                 for k in range(m):
-                    total += between[i, k] * inverse[j, k]
+                    total += half[i, k] * upper[j, k]
                 covariance[h, i, j] = covariance[h, j, i] = total
     return shift, covariance, off
 
@@ -239,6 +264,19 @@ def with_and_without(
 
 
 @compiled
+def _blend(mean: Array, other: Array, share: Array, upper: Array, backward: bool, out: Array) -> None:
+    """``out`` (6,): mean + S U' (other - mean), S = ``share`` and U = ``upper``; the roles swapped if ``backward``."""
+    for i in range(6):
+        out[i] = other[i] if backward else mean[i]
+    for k in range(6):
+        white = 0.0
+        for j in range(6):
+            white += upper[j, k] * (mean[j] - other[j] if backward else other[j] - mean[j])
+        for i in range(6):
+            out[i] += share[i, k] * white
+
+
+@compiled
 def _join(
     mean: Array,
     before: Array,
@@ -250,42 +288,44 @@ def _join(
     """One more measurement of a pose, as in a Kalman filter; the trace of its gain.  With P = ``before`` (6, 6), the
     covariance R of what was ``measured`` and the gain K = P (P + R)^-1, ``out`` is mean + K (shift - mean) (6,), the
     covariance K R (6, 6) and the errors by the model off + K (of_model - off) (f, 6), ``off`` (f or 1, 6).
-    ``work`` (4, 6, 6) is overwritten.
+    ``work`` (5, 6, 6) is overwritten.
+
+    P, R or both may leave directions open: a product of K and R, large each, has lost the other directions' digits.
+    With the smaller one C of P and R and U U' = (P + R)^-1, K R is C - (C U) (C U)': symmetric, no variance larger than
+    before, and off by no more than C is by rounding.
     """
     shift, covariance, of_model = measured
     new_mean, new_covariance, new_off = out
-    both, inverse, root, gain = work[0], work[1], work[2], work[3]
+    both, upper, white, smaller = work[0], work[1], work[2], work[3]
+    larger = 0.0
     for i in range(6):
         for j in range(6):
             both[i, j] = before[i, j] + covariance[i, j]
-    _inverse(both, inverse, root, gain)
-    taken = 0.0
+        if both[i, i] > 0.0:
+            larger += (before[i, i] - covariance[i, i]) / both[i, i]
+    backward = larger > 0.0  # from what was measured to the mean, which is known less well
     for i in range(6):
-        new_mean[i] = mean[i]
         for j in range(6):
+            smaller[i, j] = covariance[i, j] if backward else before[i, j]
+    rooted = _inverse(both, white, work[4], upper)
+    for i in range(6):
+        for j in range(6):
+            white[i, j] = 0.0
+            for k in range(6):
+                white[i, j] += smaller[i, k] * upper[k, j]
+    share, taken = white if rooted else smaller, 0.0
+    for i in range(6):
+        for j in range(6):
+            taken += share[i, j] * upper[i, j]
+        for j in range(i + 1):
             total = 0.0
             for k in range(6):
-                total += before[i, k] * inverse[k, j]
-            gain[i, j] = total
-            new_mean[i] += total * (shift[j] - mean[j])
-        taken += gain[i, i]
+                total += share[i, k] * white[j, k]
+            new_covariance[i, j] = new_covariance[j, i] = smaller[i, j] - total
+    _blend(mean, shift, share, upper, backward, new_mean)
     for f in range(len(new_off)):
-        g = min(f, len(off) - 1)
-        for i in range(6):
-            new_off[f, i] = off[g, i]
-            for j in range(6):
-                new_off[f, i] += gain[i, j] * (of_model[f, j] - off[g, j])
-    for i in range(6):
-        for j in range(6):
-            # K R is (1 - K) P, which cancels where what was known before leaves a direction open.
-            total = 0.0
-            for k in range(6):
-                total += gain[i, k] * covariance[k, j]
-            both[i, j] = total
-    for i in range(6):
-        for j in range(6):
-            new_covariance[i, j] = 0.5 * (both[i, j] + both[j, i])
-    return taken
+        _blend(off[min(f, len(off) - 1)], of_model[f], share, upper, backward, new_off[f])
+    return 6.0 - taken if backward else taken
 
 
 @compiled
@@ -356,7 +396,7 @@ def after_jumps(
     """
     count, parts = len(fit), off.shape[1]
     shifts, covariances, offs = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, parts, 6))
-    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
+    before, work = np.empty((6, 6)), np.empty((5, 6, 6))
     for r in range(count):
         h, c = fit[r], jump[r]
         for i in range(6):
@@ -575,7 +615,7 @@ def follow(
     """
     count = len(mean)
     new_mean, new_covariance, new_off, taken = mean.copy(), covariance.copy(), off.copy(), np.empty(count)
-    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
+    before, work = np.empty((6, 6)), np.empty((5, 6, 6))
     for g in range(count):
         for i in range(6):
             for j in range(6):
@@ -591,7 +631,7 @@ def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Ar
     of all of them besides: ``at`` (6,) but for a covariance ``known`` (6, 6).
     """
     new_shift, new_covariance, new_off = shift.copy(), covariance.copy(), off.copy()
-    none, work = np.zeros((off.shape[1], 6)), np.empty((4, 6, 6))
+    none, work = np.zeros((off.shape[1], 6)), np.empty((5, 6, 6))
     for h in range(len(shift)):
         out = new_shift[h], new_covariance[h], new_off[h]
         _join(shift[h], covariance[h], off[h], (at, known, none), out, work)
