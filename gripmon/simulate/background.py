@@ -6,10 +6,13 @@ between the table and the tops of boxes, motion blur.  Table frame: z into the t
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from dataclasses import dataclass
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,64 +42,19 @@ class _Block:
     faces: tuple[NDArray[np.uint8], ...]
 
 
-class TableView:
-    """Renders the background, uint8, for any pose of the gripper over the table."""
+class _Table:
+    """A table's ``tile``, two periods wide so that a view rarely crosses the seam, and the ``blocks`` on it; ``rng`` is
+    as these have left it.
+    """
 
-    def __init__(
-        self, camera: Camera, rays: RayGrid, settings: Background, nominal_cam_T_grip: Array, seed: int, psf_px: float
-    ) -> None:
-        self._camera, self._rays, self._settings = camera, rays, settings
-        self._blur_px = math.hypot(psf_px, settings.defocus_px)
-        rng = np.random.default_rng([seed, 1])
-        depth_m = nominal_cam_T_grip[2, 3] + settings.distance_m * abs(nominal_cam_T_grip[2, 2])
-        self._px_per_m = camera.fx_px / depth_m
-        self._period_m = _TILE_PX / self._px_per_m
-        self._tile = textures.table(rng, settings, _TILE_PX, self._px_per_m)
-        self._blocks = self._place_blocks(rng)
-        for block in self._blocks:
+    def __init__(self, settings: Background, seed: int, px_per_m: float) -> None:
+        self._settings, self._px_per_m, self._period_m = settings, px_per_m, _TILE_PX / px_per_m
+        self.rng = np.random.default_rng([seed, 1])
+        self._tile = textures.table(self.rng, settings, _TILE_PX, px_per_m)
+        self.blocks = self._place_blocks(self.rng)
+        for block in self.blocks:
             self._cast_shadow(block)
-        # Two periods wide, so that a view rarely crosses the seam.
-        self._tile = np.pad(self._tile, _TILE_PX // 2, mode="wrap")
-        self._path = _Path(rng, settings)
-
-    def cam_T_table(self, cam_T_grip: Array, t_s: float) -> Array:
-        """Pose (4, 4) of the table in the camera frame while the robot follows its path."""
-        x, y, turn, height_m = self._path.at(t_s)
-        c, s = math.cos(turn), math.sin(turn)
-        table_R_grip = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return cam_T_grip @ invert(make_transform(table_R_grip, np.array([x, y, -height_m])))
-
-    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
-        """Image of the table at the middle of the exposure, blurred by the motion during it."""
-        cam_T_table = self.cam_T_table(cam_T_grip, t_s)
-        image = self._floor(cam_T_table)
-        self._draw_blocks(image, cam_T_table)
-        if exposure_s > 0.0:
-            image = self._smear(image, cam_T_grip, t_s, exposure_s)
-        return np.asarray(cv2.GaussianBlur(image, (0, 0), self._blur_px), dtype=np.uint8)
-
-    def _floor(self, cam_T_table: Array) -> NDArray[np.uint8]:
-        x, y = self._rays.plane_coordinates(cam_T_table, self._px_per_m)
-        centre = x.shape[0] // 2, x.shape[1] // 2
-        half = 0.5 * _TILE_PX
-        maps = [self._rays.enlarge(m - _TILE_PX * math.floor(m[centre] / _TILE_PX) + half) for m in (x, y)]
-        image = cv2.remap(self._tile, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        return np.asarray(image, dtype=np.uint8)
-
-    def _smear(self, image: NDArray[np.uint8], cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
-        """Blur by a uniform motion over the exposure, with a small kernel."""
-        x, y, _, height_m = self._path.at(t_s)
-        below = np.array([x, y, 0.0])  # the table point below the TCP at the middle of the exposure
-        ends = []
-        for share in (-0.5, 0.5):
-            cam_T_table = self.cam_T_table(cam_T_grip, t_s + share * exposure_s)
-            point = cam_T_table[:3, :3] @ below + cam_T_table[:3, 3]
-            ends.append(np.array([self._camera.fx_px, self._camera.fy_px]) * point[:2] / max(point[2], height_m))
-        step = ends[1] - ends[0]
-        if not float(np.hypot(*step)) > _SMEAR_FROM_PX:
-            return image
-        smeared = cv2.filter2D(image, -1, _smear_kernel(step), borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(smeared, dtype=np.uint8)
+        self.tile = np.pad(self._tile, _TILE_PX // 2, mode="wrap")
 
     def _place_blocks(self, rng: np.random.Generator) -> list[_Block]:
         """Boxes at random places that don't overlap."""
@@ -153,6 +111,69 @@ class TableView:
         window = self._tile[v : v + h, u : u + w]
         shade = 1.0 - 0.5 * cv2.GaussianBlur(mask[v : v + h, u : u + w], (0, 0), 1.5).astype(np.float32) / 255.0
         window[:] = (window * shade).astype(np.uint8)
+
+
+@functools.lru_cache(maxsize=4)
+def _drawn(settings: Background, seed: int, px_per_m: float) -> _Table:
+    """Drawing one takes as long as dozens of frames, and many sequences are above the same one."""
+    return _Table(settings, seed, px_per_m)
+
+
+class TableView:
+    """Renders the background, uint8, for any pose of the gripper over the table."""
+
+    def __init__(
+        self, camera: Camera, rays: RayGrid, settings: Background, nominal_cam_T_grip: Array, seed: int, psf_px: float
+    ) -> None:
+        self._camera, self._rays = camera, rays
+        self._blur_px = math.hypot(psf_px, settings.defocus_px)
+        depth_m = nominal_cam_T_grip[2, 3] + settings.distance_m * abs(nominal_cam_T_grip[2, 2])
+        self._px_per_m = float(camera.fx_px / depth_m)
+        self._period_m = _TILE_PX / self._px_per_m
+        # How the robot moves above it, and the focus, don't change the table.
+        still = msgspec.structs.replace(settings, motion="still", speed_m_per_s=0.0, defocus_px=0.0)
+        table = _drawn(still, seed, self._px_per_m)
+        self._tile, self._blocks = table.tile, table.blocks
+        self._path = _Path(copy.deepcopy(table.rng), settings)
+
+    def cam_T_table(self, cam_T_grip: Array, t_s: float) -> Array:
+        """Pose (4, 4) of the table in the camera frame while the robot follows its path."""
+        x, y, turn, height_m = self._path.at(t_s)
+        c, s = math.cos(turn), math.sin(turn)
+        table_R_grip = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return cam_T_grip @ invert(make_transform(table_R_grip, np.array([x, y, -height_m])))
+
+    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
+        """Image of the table at the middle of the exposure, blurred by the motion during it."""
+        cam_T_table = self.cam_T_table(cam_T_grip, t_s)
+        image = self._floor(cam_T_table)
+        self._draw_blocks(image, cam_T_table)
+        if exposure_s > 0.0:
+            image = self._smear(image, cam_T_grip, t_s, exposure_s)
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), self._blur_px), dtype=np.uint8)
+
+    def _floor(self, cam_T_table: Array) -> NDArray[np.uint8]:
+        x, y = self._rays.plane_coordinates(cam_T_table, self._px_per_m)
+        centre = x.shape[0] // 2, x.shape[1] // 2
+        half = 0.5 * _TILE_PX
+        maps = [self._rays.enlarge(m - _TILE_PX * math.floor(m[centre] / _TILE_PX) + half) for m in (x, y)]
+        image = cv2.remap(self._tile, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        return np.asarray(image, dtype=np.uint8)
+
+    def _smear(self, image: NDArray[np.uint8], cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
+        """Blur by a uniform motion over the exposure, with a small kernel."""
+        x, y, _, height_m = self._path.at(t_s)
+        below = np.array([x, y, 0.0])  # the table point below the TCP at the middle of the exposure
+        ends = []
+        for share in (-0.5, 0.5):
+            cam_T_table = self.cam_T_table(cam_T_grip, t_s + share * exposure_s)
+            point = cam_T_table[:3, :3] @ below + cam_T_table[:3, 3]
+            ends.append(np.array([self._camera.fx_px, self._camera.fy_px]) * point[:2] / max(point[2], height_m))
+        step = ends[1] - ends[0]
+        if not float(np.hypot(*step)) > _SMEAR_FROM_PX:
+            return image
+        smeared = cv2.filter2D(image, -1, _smear_kernel(step), borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(smeared, dtype=np.uint8)
 
     def _draw_blocks(self, image: NDArray[np.uint8], cam_T_table: Array) -> None:
         """Paint the boxes in view from far to near."""

@@ -8,6 +8,7 @@ Sharp borders are spread over a texel, and blurred like the lens does: a texel i
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -205,11 +206,9 @@ def _papers(rng: Rng, size_px: int, px_per_m: float) -> Factor:
 def _everywhere(canvas: Grey, centre: NDArray[np.float64], reach: float, draw: Callable[..., None]) -> None:
     """Draw at a centre and at its periodic images across the seams."""
     size = canvas.shape[0]
-    for dx in (-size, 0, size):
-        for dy in (-size, 0, size):
-            moved = centre + np.array([dx, dy])
-            if (moved > -reach - 2).all() and (moved < size + reach + 2).all():
-                draw(canvas, moved)
+    ways = [[way for way in (-size, 0, size) if -reach - 2 < c + way < size + reach + 2] for c in centre.tolist()]
+    for way in itertools.product(*ways):
+        draw(canvas, centre + way)
 
 
 def _disc(image: Grey, centre: NDArray[np.float64], radius: float, grey: int, thickness: int) -> None:
