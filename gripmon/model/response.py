@@ -199,7 +199,8 @@ def _borders(grey: Sequence[NDArray[np.float32]]) -> _Borders:
 
 class _Read(NamedTuple):
     """Grey levels across borders: ``across`` (n, p, s), both sides' means ``near``, ``beyond`` (n, p), their scatters,
-    and which are ``usable`` (n, p): even on both sides, with a step, not cut off.
+    which are ``usable`` (n, p): even on both sides, with a step, not cut off; and the middle samples' ``usual`` place
+    (p, m) between both sides.
     """
 
     across: NDArray[np.float32]
@@ -208,6 +209,7 @@ class _Read(NamedTuple):
     near_sigma: Array
     beyond_sigma: Array
     usable: NDArray[np.bool_]
+    usual: Array
 
 
 _S = np.arange(-_FAR_PX, _FAR_PX + 0.01, 0.5)
@@ -229,10 +231,13 @@ def _read(grey: Sequence[NDArray[np.float32]], borders: _Borders, shifts_px: Arr
     inner, outer = across[:, :, _S <= -_NEAR_PX], across[:, :, _S >= _NEAR_PX]
     near, beyond = inner.mean(axis=2), outer.mean(axis=2)
     scatter = inner.std(axis=2), outer.std(axis=2)
-    step = np.abs(beyond - near)
-    usable = (step > _LEAST_STEP) & (np.maximum(*scatter) < _UNEVEN * step)
+    step = beyond - near
+    usable = (np.abs(step) > _LEAST_STEP) & (np.maximum(*scatter) < _UNEVEN * np.abs(step))
     usable &= (across.max(axis=2) < 0.98) & (np.minimum(near, beyond) > _NOISE)
-    return _Read(np.asarray(across, np.float32), near, beyond, *scatter, np.asarray(usable))
+    chosen = usable | ~usable.any(axis=0)
+    place = (across[:, :, _MIDDLE] - near[:, :, None]) / np.where(usable, step, 1.0)[:, :, None]
+    usual = np.nanmedian(np.where(chosen[:, :, None], place, np.nan), axis=0)
+    return _Read(np.asarray(across, np.float32), near, beyond, *scatter, np.asarray(usable), usual)
 
 
 class _Fit(NamedTuple):
@@ -247,9 +252,7 @@ def _fit(read: _Read, gamma: float) -> _Fit:
     """The middle samples with each pixel's best share, the same in all images."""
     v = read.across[:, :, _MIDDLE]
     near, beyond = read.near[:, :, None], read.beyond[:, :, None]
-    step = np.where(read.usable[:, :, None], beyond - near, 1.0)
-    usable: NDArray[np.bool_] = np.asarray(read.usable | ~read.usable.any(axis=0))
-    usual = np.nanmedian(np.where(usable[:, :, None], (v - near) / step, np.nan), axis=0)
+    usual = read.usual
     inside = read.usable[:, :, None] & (usual > 0.1) & (usual < 0.9)
     sigma = np.sqrt(
         _NOISE**2 + (usual * read.beyond_sigma[:, :, None]) ** 2 + ((1.0 - usual) * read.near_sigma[:, :, None]) ** 2
@@ -286,7 +289,7 @@ def _costs(images: Sequence[Image]) -> Array | None:
         return None
     read = _Read(
         read.across[:, enough], read.near[:, enough], read.beyond[:, enough], read.near_sigma[:, enough],
-        read.beyond_sigma[:, enough], read.usable[:, enough],
+        read.beyond_sigma[:, enough], read.usable[:, enough], read.usual[enough],
     )  # fmt: skip
     block = np.floor(np.column_stack([borders.x, borders.y])[enough] / _BLOCK_PX) @ [1.0, 1e4]
     _, block = np.unique(block, return_inverse=True)

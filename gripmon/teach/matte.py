@@ -192,27 +192,20 @@ def _displacements(images: Sequence[Plane], edges: Edges, at: Array) -> tuple[Ar
     """How far (n, 2) the gripper lies in each image from where its edges stay, px, searched around ``at`` (n, 2), and
     the share (n,) of these edges that the image then shows.
     """
-    rows, columns = np.nonzero(edges.stays)
     margin = SEARCH_PX + 1
-    inner = (
-        (rows >= margin)
-        & (columns >= margin)
-        & (rows < edges.share.shape[0] - margin)
-        & (columns < edges.share.shape[1] - margin)
-    )
-    rows, columns = rows[inner], columns[inner]
-    if len(rows) < 2 * FEWEST_IMAGES:
+    inner = slice(margin, -margin), slice(margin, -margin)
+    stays = edges.stays[inner]
+    count = np.count_nonzero(stays)
+    if count < 2 * FEWEST_IMAGES:
         return np.array(at), np.ones(len(images))
-    angle = 2.0 * edges.across_rad[rows, columns]
-    cosine, sine = np.cos(angle), np.sin(angle)
+    angle = 2.0 * edges.across_rad[inner]
+    usual = [np.where(stays, part, 0.0).astype(np.float32) for part in (np.cos(angle), np.sin(angle))]
     reach = np.arange(-SEARCH_PX, SEARCH_PX + 1)
     out, share = np.zeros((len(images), 2)), np.zeros(len(images))
     for k, image in enumerate(images):
-        c, s = doubled(shifted(image, -at[k]), LEAST_SLOPE)
-        scores = np.array([
-            [float(c[rows + dy, columns + dx] @ cosine + s[rows + dy, columns + dx] @ sine) for dx in reach]
-            for dy in reach
-        ]) / len(rows)  # fmt: skip
+        doubles = doubled(shifted(image, -at[k]), LEAST_SLOPE)
+        alike = [cv2.matchTemplate(part[1:-1, 1:-1], of, cv2.TM_CCORR) for part, of in zip(doubles, usual, strict=True)]
+        scores = np.sum(alike, axis=0, dtype=float) / count
         y, x = np.unravel_index(int(scores.argmax()), scores.shape)
         share[k] = scores[y, x]
         if share[k] < CLEARLY_BETTER * scores[SEARCH_PX, SEARCH_PX]:

@@ -167,7 +167,7 @@ def measure_transitions(
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
     weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
-    shading = 1.0 if wide else _shading(profiles, d, contrast, s, search)
+    shading = 1.0 if wide else _shading(finger[:, s <= -search], d, contrast, s, search)
     weight = weight - shading * weight.mean(axis=0)
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
@@ -215,18 +215,18 @@ def _finger_levels(profiles: NDArray[np.float32], s: Array, *, wide: bool) -> Ar
     """Grey levels (stations, samples) of the finger, to be subtracted: inside of it, its median over the images; across
     the edge and beyond, the last of these.
     """
-    usual = np.median(profiles, axis=0)
     last = int(np.flatnonzero(s <= (-4.5 if wide else -1.5))[-1])
-    usual[:, last:] = usual[:, max(last - 1, 0) : last + 1].mean(axis=1, keepdims=True)
-    return np.asarray(usual)
+    usual = np.median(profiles[:, :, : last + 1], axis=0)
+    beyond = usual[:, max(last - 1, 0) :].mean(axis=1, keepdims=True)
+    return np.hstack([usual[:, :last], np.repeat(beyond, len(s) - last, axis=1)])
 
 
-def _shading(profiles: NDArray[np.float32], d: Array, contrast: Array, s: Array, search_px: float) -> float:
+def _shading(own: Array, d: Array, contrast: Array, s: Array, search_px: float) -> float:
     """Part, 0 to 1, of the contrasts' mean to leave out.  The mean also contains the finger's own shading, which is the
-    same in all images; the contrasts' differences contain only the background.  With the shading's variance t² and the
+    same in all images; the contrasts' differences contain only the background.  ``own``: grey levels (stations,
+    samples) of the finger before the edge.  With the shading's variance t² and the
     backgrounds' texture v, known from n images: ``n t² / (n t² + v)`` (the shrinkage of a random intercept).
     """
-    own = np.median(profiles[:, :, s <= -search_px], axis=0)
     design = np.vander(s[s <= -search_px], 2)
     trend = own @ np.linalg.pinv(design).T @ design.T
     shading = float(np.median(np.square(own - trend).sum(axis=1) / max(own.shape[1] - 2, 1)))
@@ -244,21 +244,21 @@ def _read(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[
 
 
 @lru_cache(maxsize=128)
-def _bases(samples: tuple[float, ...], blur_px: float, search_px: float) -> tuple[Array, list[Array]]:
-    """Positions to try (g,), and an orthonormal basis (samples, 4) of the transition at each."""
+def _bases(samples: tuple[float, ...], blur_px: float, search_px: float) -> tuple[Array, Array]:
+    """Positions to try (g,), and an orthonormal basis of the transition at each, side by side (samples, 4 g)."""
     s = np.array(samples)
     grid = np.arange(-search_px, search_px + 0.5 * _GRID_PX, _GRID_PX)
     bases = []
     for e in grid:
         rise = ndtr((s - e) / blur_px)
         bases.append(np.linalg.qr(np.column_stack([rise, rise * (s - e), 1.0 - rise, (1.0 - rise) * (s - e)]))[0])
-    return grid, bases
+    return grid, np.hstack(bases)
 
 
 def _misfit(transition: Array, s: Array, blur_px: float, search_px: float) -> tuple[Array, Array]:
     grid, bases = _bases(tuple(s.tolist()), blur_px, search_px)
-    total = np.square(transition).sum(axis=1)
-    return grid, np.stack([total - np.square(transition @ basis).sum(axis=1) for basis in bases])
+    within = np.square(transition @ bases).reshape(-1, len(grid), 4).sum(axis=2)
+    return grid, np.square(transition).sum(axis=1) - within.T
 
 
 def _usual_blur(transition: Array, s: Array, search_px: float) -> float:
