@@ -8,8 +8,10 @@ Sharp borders are spread over a texel, and blurred like the lens does: a texel i
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import pickle
 from collections.abc import Callable
 
 import cv2
@@ -37,6 +39,18 @@ def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: fl
     """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is roughly their contrast."""
     if strength == 0.0:
         return even(height_px, width_px)
+    out, generator = _metal(pickle.dumps(rng.bit_generator.state), height_px, width_px, px_per_m, strength)
+    rng.bit_generator.state = pickle.loads(generator)
+    return out
+
+
+@functools.lru_cache(maxsize=64)
+def _metal(generator: bytes, height_px: int, width_px: int, px_per_m: float, strength: float) -> tuple[Factor, bytes]:
+    """Many sequences show the same fingers, and a texture takes as long as half a frame.  ``generator``: the state of
+    what it is drawn from, before and after.
+    """
+    rng = np.random.default_rng()
+    rng.bit_generator.state = pickle.loads(generator)
     mm = px_per_m * 1e-3
     brushed = _noise(rng, height_px, width_px, 4.0 * mm, 0.5)
     clouds = _noise(rng, height_px, width_px, 3.0 * mm, 2.0 * mm)
@@ -53,7 +67,9 @@ def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: fl
         cv2.line(line, _fixed(start - low), _fixed(end - low), 1.0, 1, cv2.LINE_8, 4)
         around += strength * float(rng.choice([-1.2, 1.0, 1.8])) * cv2.GaussianBlur(line, (0, 0), 0.6)
     fall_off = np.linspace(0.5, -0.5, width_px, dtype=np.float32)
-    return np.maximum(out + 0.8 * strength * fall_off, 0.2).astype(np.float32)
+    out = np.maximum(out + 0.8 * strength * fall_off, 0.2).astype(np.float32)
+    out.flags.writeable = False
+    return out, pickle.dumps(rng.bit_generator.state)
 
 
 def printed(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
