@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # As the command line does it, before NumPy is imported: with a thread for each core, linear algebra takes up to three
@@ -24,8 +25,10 @@ from support.long_files import LONGEST
 from support.loopback import free_endpoint, give_default_port_back, plain_session
 from support.published import Published
 
+from gripmon.daemon import forecast
 from gripmon.io.wire import PublishSettings
 from gripmon.monitor import warm_up
+from gripmon.teach.visibility import Rig
 
 # No test fails because a machine is slow; a third of the usual examples in every run finds what they find in three.
 hypothesis.settings.register_profile("unhurried", deadline=None, max_examples=35)
@@ -79,6 +82,27 @@ def _log_as_at_first() -> None:
     for each in (logger, *logging.root.manager.loggerDict.values()):
         if isinstance(each, logging.Logger) and each.name.partition(".")[0] == "gripmon":
             each.setLevel(logging.NOTSET)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _a_view_is_examined_once() -> Iterator[None]:
+    """How far the camera and the jaw may move in a view takes most of ``check``, and tests check few different ones."""
+
+    def once(examine: Callable[..., object]) -> Callable[..., object]:
+        found: dict[bytes, object] = {}
+
+        def examined(rig: Rig, *place: object) -> object:
+            key = pickle.dumps((rig._replace(gripper=rig.gripper.model), *place))
+            if key not in found:
+                found[key] = examine(rig, *place)
+            return found[key]
+
+        return examined
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("freedom", "over_jaw"):
+            patch.setattr(forecast, name, once(getattr(forecast, name)))
+        yield
 
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
