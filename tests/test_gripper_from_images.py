@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from dataclasses import replace
@@ -65,6 +66,9 @@ SCENES = {
     "soft": {"seed": 306, "kind": "chequer", "sensor": Sensor(psf_sigma_px=0.95, read_noise_dn=1.5, jpeg_quality=90)},
 }
 
+MORE = ("print", "speckle, flicker", "soft")
+"""Scenes that take more images: fewer leave borders unseen, or are too soft for a fifth of a pixel."""
+
 
 @pytest.mark.parametrize(
     "name",
@@ -78,15 +82,26 @@ SCENES = {
 def test_the_outline_lies_within_a_fifth_of_a_pixel_of_the_true_silhouette(name: str, box: tuple) -> None:
     simulator, found = moving_robot(**SCENES[name]), box[1]
     if name != "plain look":  # that is the box
-        found = gripper_from_images(images_of(simulator), PAPER_LENS, distance_m=DISTANCE)
+        images = images_of(simulator, 30 if name in MORE else 15)
+        found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     away = beside_truth_px(chains_of(found), coverage(simulator))
     assert len(away) > 200
     assert np.quantile(away, 0.95) <= 0.2
     assert found.outline_sigma_px < 0.2
 
 
-@pytest.mark.parametrize("name", ["plain look", "two tones", "cut by the border"])
-@pytest.mark.parametrize("count", [5, 7])
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        *itertools.product(["plain look"], [5, 7]),
+        ("two tones", 7),
+        ("cut by the border", 5),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow("6 s; the same look or as few images are in the default run"))
+            for each in (("two tones", 5), ("cut by the border", 7))
+        ),
+    ],
+)
 def test_of_few_images_what_is_written_is_right_and_the_rest_is_left_out(name: str, count: int) -> None:
     """Backgrounds agree by chance in five images: of outlines found there up to a quarter was wrong."""
     simulator = moving_robot(**SCENES[name])
@@ -248,7 +263,7 @@ def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
     """Told a distance that is a standard deviation too long: nothing in an image can show that."""
     images, exact = box
     sigma_m = 0.002
-    found = gripper_from_images(images, PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
+    found = gripper_from_images(images[::2], PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
     assert found.gripper.model.scale_sigma == pytest.approx(sigma_m / (DEPTH_M + sigma_m), rel=0.05)
     scenario = Scenario(name="x", duration_s=2.0, fps=15.0, background=Background(kind="printed"))
     simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
@@ -349,7 +364,7 @@ def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(ra
 
 def test_openings_in_metres_tell_distance_and_motion() -> None:
     images, openings = [], []
-    for seed, opening_m, count in ((401, 0.034, 24), (402, 0.024, 12)):
+    for seed, opening_m, count in ((401, 0.034, 15), (402, 0.024, 12)):
         images += images_of(moving_robot(seed, "printed", opening_m=opening_m), count)
         openings += [opening_m] * count
     found = gripper_from_images(images, PAPER_LENS, openings_m=openings)
@@ -367,7 +382,7 @@ def test_openings_in_metres_tell_distance_and_motion() -> None:
 
 
 def test_a_fingers_width_or_a_calibration_give_the_scale(box: tuple) -> None:
-    images, _ = box
+    images = box[0][::2]
     by_width = gripper_from_images(images, PAPER_LENS, finger_width_m=(0.010, 1e-4))
     assert abs(by_width.cam_T_grip[2, 3] - DEPTH_M) < 0.02 * DEPTH_M
     pose, covariance = nominal_cam_T_grip(), np.diag([1e-8] * 3 + [1e-6] * 3)
@@ -380,7 +395,7 @@ def test_a_fingers_width_or_a_calibration_give_the_scale(box: tuple) -> None:
 
 def test_images_that_contradict_are_left_out_and_named(box: tuple) -> None:
     images, found = box
-    spoilt = list(images)
+    spoilt = images[:18]
     spoilt[4] = np.roll(images[4], 3, axis=1)
     spoilt[9] = cv2.GaussianBlur(images[9], (0, 0), 2.5)
     spoilt[17] = np.roll(images[17], 40, axis=0)
@@ -399,8 +414,8 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
     still = images_of(moving_robot(303, motion="still"), 12)
     rng = np.random.default_rng(1)
     noise = [np.clip(image + rng.normal(0.0, 1.0, image.shape), 0, 255).astype(np.uint8) for image in still]
-    blurred = [cv2.GaussianBlur(image, (0, 0), 4.0) for image in images[:15]]
-    moved = [np.roll(image, 9 * k, axis=1) for k, image in enumerate(images[:15])]
+    blurred = [cv2.GaussianBlur(image, (0, 0), 4.0) for image in images[:10]]
+    moved = [np.roll(image, 9 * k, axis=1) for k, image in enumerate(images[:10])]
     narrow = nominal_cam_T_grip(tcp_m=(0.012, -0.012, 0.14))
     other = images_of(moving_robot(310, cam_T_grip=narrow), 12)
     for wrong, word in (
@@ -413,7 +428,7 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
             gripper_from_images(wrong, PAPER_LENS, distance_m=DISTANCE)
         assert "\n" not in str(caught.value)
     with pytest.raises(NoResultError, match=r"10 of 25 images show one opening, from image 16 to image 25; .* blurred"):
-        gripper_from_images([*images[15:30], *blurred[:10]], PAPER_LENS, openings_m=[0.03] * 15 + [0.02] * 10)
+        gripper_from_images([*images[15:30], *blurred], PAPER_LENS, openings_m=[0.03] * 15 + [0.02] * 10)
 
 
 def test_wrong_input_says_what_would_be_right(box: tuple) -> None:
@@ -474,7 +489,7 @@ def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys:
     images, found = box
     folder = tmp_path / "free"
     folder.mkdir()
-    for k, image in enumerate(images):
+    for k, image in enumerate(images[::2]):
         cv2.imwrite(str(folder / f"{k:03d}.png"), image)
     _camera_file(tmp_path / "camera.yaml")
     wrong = ["gripper", "from-images", "nowhere", "--camera", str(tmp_path / "camera.yaml")]
@@ -485,7 +500,7 @@ def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys:
     outputs += ["--picture", str(tmp_path / "gripper.png")]
     assert main([*words, "--distance", "0.115:0.002", *outputs, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said["images"] == 30
+    assert said["images"] == 15
     assert read_gripper(tmp_path / "gripper.yaml").corner_ids == found.gripper.corner_ids
     assert cv2.imread(str(tmp_path / "gripper.png")).shape == (1152, 1536, 3)
     (tmp_path / "config.yaml").write_text(

@@ -131,7 +131,7 @@ def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:
     from benchmarks.meshes import MeshCamera
 
     pictures = MeshCamera(CAMERA, tapered()[:1], 5)
-    images = [pictures.picture(POSE) for _ in range(20)]
+    images = [pictures.picture(POSE) for _ in range(12)]
     with pytest.raises(UnclearPartsError, match="--fingers 1"):
         gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
     found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE, fingers=1)

@@ -1,7 +1,7 @@
 """The files whose tests take longest, to be begun first: a long one that is begun last keeps one worker busy alone.
 
-By processor time with that of the processes that they start, from two hundred seconds down to ten; then those that
-mostly wait.  How exact the order is matters little.  ``tools/test --durations 100`` shows what has become long.
+By processor time with that of the processes that they start, from a hundred and fifty seconds down to ten; then those
+that mostly wait.  How exact the order is matters little.  ``tools/test --durations 100`` shows what has become long.
 """
 
 from __future__ import annotations
@@ -10,33 +10,35 @@ LONGEST = (
     "test_gripper_from_images",
     "test_first_run",
     "test_dataset",
-    "test_gripper_from_openings",
     "test_trust",
     "test_setup",
     "test_trust_shapes",
-    "test_check_findings",
+    "test_gripper_from_openings",
     "test_monitor",
     "test_setup_page",
     "test_gripper_cad_tracked",
-    "test_strips",
+    "test_check_findings",
+    "test_calibrate_intrinsics",
     "test_vector_code",
     "test_cli",
     "test_curved_edges",
     "test_spotwatch",
+    "test_look",
     "test_restart",
     "test_bench_real_images",
     "test_replay_recording",
+    "test_replay_full_disk",
     "test_laser_spots",
     "test_smoothing",
     "test_detection_marked",
     "test_simulator_pictures",
     "test_simulated_calibrations",
+    "test_strips",
     "test_replay",
     "test_calibrate_command",
     "test_daemon_processes",
     "test_short_edges",
     "test_report_command",
-    "test_replay_full_disk",
     "test_report",
     "test_causes_images",
     "test_run_on_the_network",
@@ -47,7 +49,6 @@ LONGEST = (
     "test_simulated_sources",
     "test_recording_losses",
     "test_killed",
-    "test_calibrate_intrinsics",
     "test_backlog",
     "test_promise",
     "test_recording_faults",
@@ -55,7 +56,6 @@ LONGEST = (
     "test_onboarding",
     "test_api",
     "test_repeats",
-    "test_look",
     "test_ros2_processes",
     "test_client_processes",
     "test_parquet_example",
