@@ -109,6 +109,21 @@ def test_what_edges_enclose_is_the_gripper_and_no_plain_wall(count: int, wall: b
     assert (found & ~still).sum() < 0.15 * still.sum()
 
 
+def test_a_small_face_on_which_shadows_come_and_go_is_the_grippers():
+    """Beside a finger at the image's border, smaller than a cell: by how much of it changes, it began as background."""
+    pad = [(100, 229), (112, 229), (112, 239), (100, 239)]
+    own = polygons(pad)
+    face, shown = cv2.GaussianBlur(own.astype(np.float32), (0, 0), 0.8), []
+    for k, picture in enumerate(pictures(polygons(LEFT, RIGHT, pad), 12, wall=False)):
+        shadow = np.zeros(SHAPE, np.float32)
+        shadow[:, 106:112] = 60.0 if k % 4 <= 1 else 0.0
+        shown.append(picture + face * (50.0 + shadow))
+    edges = edges_that_stay(shown)
+    assert 0.3 < edges.changing[own].mean() < 0.5 * edges.most_changing
+    found = enclosed(edges)
+    assert found is not None and found[own].mean() > 0.7
+
+
 def test_nothing_is_enclosed_where_nothing_changes():
     rng = np.random.default_rng(1)
     first = pictures(polygons(LEFT), 1, wall=False)[0]

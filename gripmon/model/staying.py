@@ -25,6 +25,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gripmon.model.records import Array
 
@@ -182,8 +184,14 @@ def enclosed(edges: Edges) -> Bits | None:
     if most < LEAST_CHANGING:
         return None
     one, other, total, length_px = _boundaries(labels, edges)
+    changes = changing > min(CHANGING_PART, 0.5 * most)
+    joined = changes[one] & changes[other] & (total <= edges.limit * length_px)
+    parts = coo_array((np.ones(np.count_nonzero(joined)), (one[joined], other[joined])), shape=(count, count))
+    part = connected_components(parts, directed=False)[1]
+    # What edges that stay cut off from a cell may as well be a shadow, unless it changes like most of the background.
+    changes &= (np.bincount(part, area, minlength=count)[part] >= CELL_PX**2) | (changing > 0.5 * most)
     total += CHANGE_WORTH * length_px * np.abs(changing[one] - changing[other])
-    start = np.where(changing > min(CHANGING_PART, 0.5 * most), 0, np.arange(count))
+    start = np.where(changes, 0, np.arange(count))
     return np.asarray(_merged(one, other, total, length_px, start, edges.limit)[labels] != 0)
 
 
