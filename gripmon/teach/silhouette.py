@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri, stdtrit
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -44,6 +44,12 @@ FEWEST_CLEAR = 4
 FEWEST_BACKGROUNDS = 2
 """Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
 within a background the grey level on the finger's side changes, and the image isn't used there."""
+WITHIN_PX = 1.0
+"""How far beside its edge an outline may be taken to be: search lines at work reach 3 px to either side."""
+RISEN = 0.75
+"""Part of a contrast that shows two thirds of the blur (the normal distribution's quantile) beyond an edge."""
+BY_CHANCE = 0.01
+"""How often grey levels of backgrounds beyond an edge may be taken for something that stays there."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -190,6 +196,25 @@ def measure_transitions(
         folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
+
+
+def goes_on_beyond(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
+    """Whether something that stays, not the background, shows beyond an edge at these stations in ``images`` (n, h, w):
+    a narrow face of the finger, so that its outline is more than :data:`WITHIN_PX` away.
+
+    An edge so far out would leave more than a quarter of the contrast open where this is asked.  Of backgrounds, grey
+    levels there are as often above as below those 4.5 to 8 px out; what stays differs from them in the mean: Student's
+    t over the images, of means along the edge.  A face of 6 px and more isn't told, nor one of the backgrounds' grey.
+    """
+    s = np.arange(-_NARROW_PX, _WIDE_PX + 0.25, _STEP_PX)
+    levels = _read(images, stations, s).mean(axis=1)
+    far = levels[:, s >= 4.5].mean(axis=1)
+    begun_px = WITHIN_PX + float(ndtri(RISEN)) * blur_px
+    off = np.array([np.interp(begun_px, s, own) for own in levels]) - far
+    scatter = float(np.std(off, ddof=1)) / len(off) ** 0.5
+    contrast = float(np.sqrt(np.square(far - levels[:, (s >= -4.0) & (s <= -2.0)].mean(axis=1)).mean()))
+    least = max(float(stdtrit(len(off) - 1, 1.0 - 0.5 * BY_CHANCE)) * scatter, (1.0 - RISEN) * contrast)
+    return abs(float(off.mean())) > least
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.silhouette import Stations, from_ideal_px, lines_in_image, measure_transitions, to_ideal_px
+from gripmon.teach.silhouette import (
+    Stations,
+    from_ideal_px,
+    goes_on_beyond,
+    lines_in_image,
+    measure_transitions,
+    to_ideal_px,
+)
 from gripmon.track.edges.prediction import STRETCH
 
 SHORTEST_PIECE_PX = 6.0
@@ -369,6 +376,9 @@ def _measured(
     distances = signs * np.array([d for _, d in folds])
     at_ends = jackknife_sigma(normals @ np.transpose(ends) - distances[:, None])
     if float(at_ends.max()) > WORST_SIGMA_PX:
+        return None
+    stations = _stations_on(camera, *ends, outward, min(END_MARGIN_PX, 0.2 * length), images[0].shape)
+    if stations is None or goes_on_beyond(images, stations, blur_px):
         return None
     return _Line(line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean()))
 
