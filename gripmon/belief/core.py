@@ -274,8 +274,13 @@ class Belief:
                     factor = jumps.factors[j, : jumps.ranks[j]]
                     self._node(i, h, int(j), float(bank.log_weight[h] + due + math.log(jumps.share[j])), factor, asked)
                     made[h, int(j)], i = i, i + 1
-                if (h, int(j)) in made:
-                    n = put(candidates, n, nodes, made[h, int(j)], doubts, bank, asked)
+                if (h, int(j)) not in made:
+                    continue
+                m = put(candidates, n, nodes, made[h, int(j)], doubts, bank, asked)
+                if m > n:  # policy, whatever the ends that aren't trusted say of it
+                    floor_of = candidates.log_weight[c] + due + math.log(jumps.share[j])
+                    candidates.log_weight[n] = max(candidates.log_weight[n], floor_of)
+                n = m
         return n
 
     def _jump(self, n: int, asked: Asked, dt_s: float, hidden_knock: float, least: float) -> int:

@@ -16,7 +16,18 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief.doubts import Table
-from gripmon.belief.rows import backward, foreign, forward, gains, log_sum, normal, not_drawn, root_of, shift_row
+from gripmon.belief.rows import (
+    backward,
+    foreign,
+    forward,
+    gains,
+    log_sum,
+    normal,
+    not_drawn,
+    root_of,
+    shift_row,
+    strength_of,
+)
 from gripmon.belief.state import LENGTHS, SIZE, Bank, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
@@ -212,7 +223,7 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
             for row in range(2):
                 way = seen.rows[edge, of, row, _FIRST] + seen.rows[edge, of, row, _FIRST + 1]
                 missing = seen.lines[edge, of, row] - nodes.at[i, edge, row]
-                variance = near + nodes.wide[i, edge, row] + seen.strength[edge] + seen.white[edge, of, row]
+                variance = near + nodes.wide[i, edge, row] + strength_of(seen, edge, row) + seen.white[edge, of, row]
                 log += normal(missing, variance)
                 cross += way * missing / variance
                 along += way * way / variance

@@ -155,6 +155,14 @@ def add_noise(bank: Bank, h: int, mean: Array, covariance: Array, factor: Array)
 
 
 @compiled
+def strength_of(seen: Seen, edge: int, row: int) -> float:
+    """Variance of the background's error of one of an edge's rows: of errors that are independent along it, that of the
+    slope times half the length is three times that of the offset.
+    """
+    return seen.strength[edge] * (3.0 if row == 1 else 1.0)
+
+
+@compiled
 def fade(bank: Bank, h: int, seen: Seen) -> None:
     """The errors before the backgrounds that are behind the edges now: as like them as the pictures are."""
     for q in range(bank.offset.shape[1]):
@@ -168,7 +176,7 @@ def fade(bank: Bank, h: int, seen: Seen) -> None:
         for k in range(bank.offset.shape[2]):
             bank.spread[h, q, s, k] *= rho
             bank.spread[h, q, k, s] *= rho
-        bank.spread[h, q, s, s] += (1.0 - rho * rho) * seen.strength[edge]
+        bank.spread[h, q, s, s] += (1.0 - rho * rho) * strength_of(seen, edge, q % 2)
 
 
 @compiled
@@ -243,7 +251,7 @@ def foreign(
     and stays in any case.  ``fresh``: the doubt begins; of one that begins while nothing is shown the place is drawn
     when something is.  ``near``: it may be near.  ``keep``: it is learnt, and what wasn't shown fades.
     """
-    count, strength = seen.found[edge], seen.strength[edge]
+    count = seen.found[edge]
     if count == 0 and fresh:
         for kind in range(FOREIGN_KINDS if keep else 0):
             bank.place_spread[h, edge, kind, :, :] = 0.0
@@ -274,11 +282,11 @@ def foreign(
                         place[row, 1] = like * bank.place[h, edge, kind, row, 1]
                         spread[row, 0] = stays * stays * was[0] + (1.0 - stays * stays) * sizes[kind]
                         spread[row, 1] = stays * like * was[1]
-                        spread[row, 2] = like * like * was[2] + (1.0 - like * like) * strength
+                        spread[row, 2] = like * like * was[2] + (1.0 - like * like) * strength_of(seen, edge, row)
                     else:
                         missing = seen.lines[edge, of, row] - seen.searched[edge, of, row]
                         place[row, 0], place[row, 1] = 0.0, 0.0
-                        spread[row, 0], spread[row, 1], spread[row, 2] = sizes[kind], 0.0, strength
+                        spread[row, 0], spread[row, 1], spread[row, 2] = sizes[kind], 0.0, strength_of(seen, edge, row)
                         if kind == NEAR:
                             place[row, 0] = at[row] - seen.searched[edge, of, row]
                             spread[row, 0] += wide[row]

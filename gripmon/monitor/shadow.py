@@ -75,6 +75,7 @@ class Shadow:
             risk=settings.policy.integrity_risk, most=most, covariance=covariance,
         )  # fmt: skip
         self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, when it was seen last
+        self._floor_px = settings.corners.consensus.edge_floor_px  # what averaging along an edge doesn't remove
         self._frames: dict[int, Frame2d] = {}
         self._last_s: float | None = None
         self._jaw_m: float | None = None
@@ -167,7 +168,7 @@ class Shadow:
                 image_white[edge, k] = line.image_px2
             if of:
                 texture = TEXTURE_PX * _texture(beside, edge, noise)
-                strength[edge] = (texture / max(abs(of[0].step), 1.0)) ** 2 / of[0].points
+                strength[edge] = (texture / max(abs(of[0].step), 1.0)) ** 2 / of[0].points + self._floor_px**2
                 asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0

@@ -154,8 +154,13 @@ def _noise(priors: Priors, frames: Sequence[Told], at: Sequence[At], others: Seq
     for a, (i, e, r) in enumerate(at):
         for b, (j, other, row) in enumerate(others):
             if (e, r) == (other, row):
-                out[a, b] = priors.lasting_px**2 + float(frames[i].seen.strength[e]) * _faded(frames, e, i, j)
+                out[a, b] = priors.lasting_px**2 + _strength(frames[i], e, r) * _faded(frames, e, i, j)
     return out
+
+
+def _strength(frame: Told, edge: int, row: int) -> float:
+    """Of white errors along -1 to 1, the slope's variance over the offset's."""
+    return float(frame.seen.strength[edge]) * (1.0, 3.0)[row]
 
 
 def _expected(priors: Priors, frames: Sequence[Told], bad: Array, at: At) -> tuple[float, float]:
@@ -197,7 +202,7 @@ def _stretch(
             values = [float(frames[t].seen.lines[edge, 0, r] - seen.searched[edge, 0, r]) for t in shown]
             covariance = np.array([[
                 size**2 * _faded(frames, edge, i, j, held) + wide * left[a] * left[b]
-                + float(frames[i].seen.strength[edge]) * _faded(frames, edge, i, j)
+                + _strength(frames[i], edge, r) * _faded(frames, edge, i, j)
                 + (float(frames[i].seen.white[edge, 0, r]) if i == j else 0.0)
                 for b, j in enumerate(shown)] for a, i in enumerate(shown)])  # fmt: skip
             part += _normal(np.array(values) - away * np.array(left), covariance)

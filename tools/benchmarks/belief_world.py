@@ -168,7 +168,7 @@ class World:
         edges = len(self.view.along)
         self._g = rng.normal(size=SIZE) * np.sqrt(np.diag(priors.covariance()))
         self._g[:12] = 0.0
-        self._lasting, self._back = self._noise(priors.lasting_px, edges), self._noise(BACKGROUND_PX, edges)
+        self._lasting, self._back = self._noise(priors.lasting_px, edges), np.zeros((edges, 2))
         self._busier = 3.0 if "rates" in differs else 1.0
         rare = [n == "finger" or n.startswith("fooled") for n in self.view.names]  # strata of their own
         first = [d.rates.first for d in self.view.doubts]
@@ -198,7 +198,8 @@ class World:
         if not first:
             light = self._move()
             self._begin(like)
-        self._back = like[:, None] * self._back + np.sqrt(1.0 - like[:, None] ** 2) * self._noise(BACKGROUND_PX, edges)
+        new = self._noise(BACKGROUND_PX, edges) * (1.0, math.sqrt(3.0))
+        self._back = like[:, None] * self._back + np.sqrt(1.0 - like[:, None] ** 2) * new
         own = self.view.rows @ self._g
         foreign = self._foreign(own, like)
         shown = np.ones(edges, bool)
