@@ -87,89 +87,114 @@ class Nodes(NamedTuple):
         )  # fmt: skip
 
 
+class Expected(NamedTuple):
+    """Where an edge's lines would be if they were the gripper's, by each line's rows: ``place`` (l, 2), whitened slopes
+    ``way`` (l, 2, 23), their variance ``prior`` (l, 2), and that of the rows' own errors, ``noise`` (2,).
+    """
+
+    place: Array
+    way: Array
+    prior: Array
+    noise: Array
+
+
 @compiled
 def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen, sizes: Array, doubted: int) -> None:
     """Node ``i``: hypothesis ``h``, whose edges ``doubted`` (bits) it doubted before, after noise ``factor`` (r, 23) on
     g.
     """
-    mean, r = bank.mean[h], len(factor)
+    r, lines = len(factor), seen.lines.shape[1]
     covariance, gain, between = bank.covariance[h].copy(), np.empty((r, SIZE)), np.empty((r, r))
-    root, along, line = nodes.root[i], np.empty(r), np.empty(SIZE)
     if r:
-        gains(covariance, factor, gain, between, root)
+        gains(covariance, factor, gain, between, nodes.root[i])
     else:
-        root_of(covariance, root)
-    information, pull = nodes.information[i], nodes.pull[i]
-    information[:, :] = 0.0
-    pull[:] = 0.0
+        root_of(covariance, nodes.root[i])
+    nodes.information[i, :, :] = 0.0
+    nodes.pull[i, :] = 0.0
     nodes.hope[i] = 0.0
-    lines = seen.lines.shape[1]
-    noise, expected, known = np.empty(2), np.empty(2), np.empty((2, SIZE))
-    places, spreads, ways = np.empty((lines, 2)), np.empty((lines, 2)), np.empty((lines, 2, SIZE))
+    expected = Expected(np.empty((lines, 2)), np.empty((lines, 2, SIZE)), np.empty((lines, 2)), np.empty(2))
     for edge in range(len(seen.found)):
         nodes.joint[i, edge] = False
         nodes.at[i, edge], nodes.wide[i, edge] = seen.searched[edge, 0], 0.0
         nodes.base[i, edge] = nodes.free[i, edge] = nodes.held[i, edge] = 0.0
-        if seen.found[edge] == 0:
-            continue
-        s = 1 + seen.background[edge]
-        for row in range(2):
-            q = 2 * edge + row
-            offset, slope, spread = bank.offset[h, q], bank.slope[h, q], bank.spread[h, q]
-            noise[row] = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s]
-            expected[row] = offset[0] + offset[s]
+        if seen.found[edge] > 0:
+            expect(expected, nodes.root[i], bank, h, factor, gain, between, seen, edge)
+            take(nodes, i, expected, seen, edge, sizes)
+            leave(nodes, i, bank, h, seen, edge, sizes, (doubted >> edge) & 1 == 0 or not_drawn(bank, h, edge))
+
+
+@compiled
+def expect(
+    into: Expected, root: Array, bank: Bank, h: int, factor: Array, gain: Array, between: Array, seen: Seen, edge: int
+) -> None:  # fmt: skip
+    """An edge's lines by hypothesis ``h``, after noise ``factor`` (r, 23) on g whose covariance has ``root`` then."""
+    mean, r, s = bank.mean[h], len(factor), 1 + seen.background[edge]
+    along, known, line = np.empty(r), np.empty(SIZE), np.empty(SIZE)
+    for row in range(2):
+        q = 2 * edge + row
+        offset, slope, spread = bank.offset[h, q], bank.slope[h, q], bank.spread[h, q]
+        into.noise[row] = spread[0, 0] + 2.0 * spread[0, s] + spread[s, s]
+        expected = offset[0] + offset[s]
+        for j in range(SIZE):
+            known[j] = slope[0, j] + slope[s, j]
+        if r:
+            expected += shift_row(mean, factor, gain, known, along)
+            for j in range(r):
+                for k in range(r):
+                    into.noise[row] += along[j] * between[j, k] * along[k]
+        for of in range(seen.found[edge]):
+            place, prior, way = expected, 0.0, into.way[of, row]
             for j in range(SIZE):
-                line[j] = slope[0, j] + slope[s, j]
-            if r:
-                expected[row] += shift_row(mean, factor, gain, line, along)
-                for j in range(r):
-                    for k in range(r):
-                        noise[row] += along[j] * between[j, k] * along[k]
-            known[row] = line
-            for of in range(seen.found[edge]):
-                place, prior, way = expected[row], 0.0, ways[of, row]
-                for j in range(SIZE):
-                    line[j] = known[row, j] + seen.rows[edge, of, row, j]
-                    place += line[j] * mean[j]
-                for j in range(SIZE):
-                    total = 0.0
-                    for k in range(j, SIZE):
-                        total += root[k, j] * line[k]
-                    way[j] = total
-                    prior += total * total
-                places[of, row], spreads[of, row] = place, prior + noise[row]
-        of, share = which(seen, edge, places, spreads, sizes)
-        nodes.line[i, edge], nodes.base[i, edge] = of, share
-        usual = max(of, 0)
-        nodes.at[i, edge], nodes.wide[i, edge] = places[usual], spreads[usual]
-        for row in range(2):
-            white = nodes.rows[i, edge, row]
-            variance = noise[row] + seen.white[edge, usual, row]
-            if of < 0:
-                white[:] = 0.0
-                nodes.missing[i, edge, row] = 0.0
-                nodes.hope[i] -= 0.5 * math.log(2.0 * math.pi * variance)
-                continue
-            scale = 1.0 / math.sqrt(variance)
+                line[j] = known[j] + seen.rows[edge, of, row, j]
+                place += line[j] * mean[j]
             for j in range(SIZE):
-                white[j] = ways[of, row, j] * scale
-            zeta = (seen.lines[edge, of, row] - places[of, row]) * scale
-            nodes.missing[i, edge, row], nodes.noise[i, edge, row] = zeta, variance
-            nodes.base[i, edge] -= 0.5 * math.log(2.0 * math.pi * variance)
-            add_row(information, pull, white, zeta, 1.0)
+                total = 0.0
+                for k in range(j, SIZE):
+                    total += root[k, j] * line[k]
+                way[j] = total
+                prior += total * total
+            into.place[of, row], into.prior[of, row] = place, prior
+
+
+@compiled
+def take(nodes: Nodes, i: int, expected: Expected, seen: Seen, edge: int, sizes: Array) -> None:
+    """An edge for one of its lines, or for none of them."""
+    of, share = which(seen, edge, expected.place, expected.prior + expected.noise, sizes)
+    nodes.line[i, edge], nodes.base[i, edge] = of, share
+    usual = max(of, 0)
+    nodes.at[i, edge], nodes.wide[i, edge] = expected.place[usual], expected.prior[usual] + expected.noise
+    for row in range(2):
+        white = nodes.rows[i, edge, row]
+        variance = expected.noise[row] + seen.white[edge, usual, row]
         if of < 0:
-            nodes.hope[i] -= share
-        fresh = (doubted >> edge) & 1 == 0 or not_drawn(bank, h, edge)
-        at, wide = nodes.at[i, edge], nodes.wide[i, edge]
-        apart = wide[0] > APART_PX**2 and seen.fitted[edge] >= 0  # then the fit says where its own would be
-        if apart:
-            at[:], wide[:] = seen.searched[edge, seen.fitted[edge]], 0.0
-        nodes.joint[i, edge] = fresh and apart
-        nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
-        nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, True, False)
-        nodes.held[i, edge] = nodes.free[i, edge]
-        if not fresh:
-            nodes.held[i, edge] = foreign(bank, h, seen, edge, fresh, True, sizes, at, wide, True, False)
+            white[:] = 0.0
+            nodes.missing[i, edge, row] = 0.0
+            nodes.hope[i] -= 0.5 * math.log(2.0 * math.pi * variance)
+            continue
+        scale = 1.0 / math.sqrt(variance)
+        for j in range(SIZE):
+            white[j] = expected.way[of, row, j] * scale
+        zeta = (seen.lines[edge, of, row] - expected.place[of, row]) * scale
+        nodes.missing[i, edge, row], nodes.noise[i, edge, row] = zeta, variance
+        nodes.base[i, edge] -= 0.5 * math.log(2.0 * math.pi * variance)
+        add_row(nodes.information[i], nodes.pull[i], white, zeta, 1.0)
+    if of < 0:
+        nodes.hope[i] -= share
+
+
+@compiled
+def leave(nodes: Nodes, i: int, bank: Bank, h: int, seen: Seen, edge: int, sizes: Array, fresh: bool) -> None:
+    """An edge to another thing; ``fresh``: nothing was seen of that before."""
+    at, wide = nodes.at[i, edge], nodes.wide[i, edge]
+    apart = wide[0] > APART_PX**2 and seen.fitted[edge] >= 0  # then the fit says where its own would be
+    if apart:
+        at[:], wide[:] = seen.searched[edge, seen.fitted[edge]], 0.0
+    nodes.joint[i, edge] = fresh and apart
+    nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
+    nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, True, False)
+    nodes.held[i, edge] = nodes.free[i, edge]
+    if not fresh:
+        nodes.held[i, edge] = foreign(bank, h, seen, edge, fresh, True, sizes, at, wide, True, False)
 
 
 @compiled
