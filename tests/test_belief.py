@@ -13,7 +13,7 @@ from support.belief_paths import sum_of_paths
 
 from gripmon.belief import bound
 from gripmon.belief.core import Belief
-from gripmon.belief.doubts import Doubt, Rates, Told, of_edges, of_mount
+from gripmon.belief.doubts import Doubt, Rates, Table, Told, log_told, of_edges, of_ends, of_mount
 from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
@@ -410,6 +410,36 @@ def test_a_mount_that_creeps_fast_is_followed_as_one_that_is_loose() -> None:
         believed = belief.update(frame.seen, DT_S)
         assert np.linalg.norm((believed.motion - motion)[:3]) < believed.bound.position_m < 1e-4
     assert sum(weight for doubts, weight in belief.weights.items() if doubts >> 8 & 1) > 0.9
+
+
+def test_who_stops_trusting_the_ends_expects_a_knock_at_once() -> None:
+    """Ends that turn into something else's in a frame: what hides them is what knocks, and the edges along the fingers
+    don't see it.
+    """
+    bounds_m = {}
+    for unseen_knock in (1e-3, 0.0):
+        rng, edges = np.random.default_rng(4), 8
+        frames = frames_of(rng, edges, 8, 0.3, clean=True)
+        ends = np.arange(edges) >= 5
+        along = np.array([0.0, 0.0, 1.0])
+        for frame in frames:
+            frame.seen.rows[~ends, ..., 2] = frame.seen.rows[~ends, ..., 14] = 0.0  # they don't see the fingers' way
+        for frame in frames[4:]:
+            frame.seen.lines[ends, 0] += rng.normal(0.0, 5.0, (ends.sum(), 2))
+        doubts = [*of_edges(edges, 1), *of_ends([ends])]
+        belief = Belief(doubts, along, replace(STEADY, unseen_knock=unseen_knock, knock_per_s=1e-15, small_per_s=1e-15))
+        bounds_m[unseen_knock] = [belief.update(frame.seen, DT_S).bound.position_m for frame in frames]
+        assert bounds_m[unseen_knock][3] < 1e-4
+    assert bounds_m[1e-3][4] > 3e-3
+    assert bounds_m[0.0][4] < 1e-3
+
+
+def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:
+    table = Table.of(of_ends([np.array([True, False]), np.array([False, True])]))
+    told = Told(np.log([0.5, 0.4]), np.log([0.1, 0.2]), np.zeros(2, bool), 0.95, np.full(2, np.nan))
+    here = log_told(0, 0, table, told, True, np.zeros(2, bool))
+    elsewhere = log_told(0, 0, table, told, True, np.array([True, False]))
+    assert np.exp([here, elsewhere]) == pytest.approx([0.5 * 0.4, 0.1 * 0.4])
 
 
 @pytest.mark.parametrize(("fault", "within"), [(None, 0.9), ("knock", 0.7), ("opening", 0.8)])

@@ -9,11 +9,12 @@ from support.meters import box_gripper, difference, moved
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
 from support.watched import frames_of, new_monitor, reference_of, watched
 
-from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, Seen
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, SIZE, Seen
 from gripmon.model.camera import make_camera
+from gripmon.model.poses import perturb
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.edge_lines import lines_of
+from gripmon.monitor.edge_lines import Frame2d, Line, lines_of, merged
 from gripmon.monitor.shadow import Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
@@ -136,6 +137,49 @@ def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None
     assert len(lines_of(offset, sample, fraction[sample], np.zeros(len(of), bool), 20)) == 2
     noise = of == 3
     assert lines_of(offset[noise], sample[noise], fraction[sample[noise]], np.zeros(noise.sum(), bool), 20) == []
+
+
+def test_a_line_that_stands_still_is_the_same_line_whatever_is_seen_of_it() -> None:
+    """Two stretches of one line, in the frame of the edge that was seen there first."""
+    frame = Frame2d(np.array([100.0, 50.0]), np.array([20.0, 0.0]))
+    for first, last in ((80.0, 120.0), (115.0, 160.0)):
+        x = np.linspace(first, last, 12)
+        place, variance = frame.line(np.column_stack([x, 52.0 + 0.1 * (x - 100.0)]), np.ones(12))
+        assert place == pytest.approx([2.0, 2.0], abs=1e-9)
+        basis = np.column_stack([np.ones(12), (x - 100.0) / 20.0])
+        assert variance == pytest.approx(np.diag(np.linalg.inv(basis.T @ basis)))
+
+
+def test_a_line_of_two_looks_is_one_and_the_fits_own_is_named() -> None:
+    def line(place_px: float, agrees: bool) -> Line:
+        two = np.zeros(2)
+        return Line(np.zeros((2, SIZE)), np.array([place_px, 0.0]), two, two, two, two, 10.0, 50.0, agrees)
+
+    looks = [[line(0.1, True), line(4.0, False)], [line(4.2, True), line(-20.0, False)]]
+    assert [of.place_px[0] for of in merged(looks, 1)[0]] == [0.1, 4.0, -20.0]
+    assert [merged(looks, by)[1] for by in (0, 1)] == [0, 1]
+    assert merged([[], [line(1.0, False)]], 0)[1] == -1
+
+
+def test_the_gripper_is_looked_for_where_it_is_believed_to_be_though_the_fit_slid_away() -> None:
+    """Six millimetres along the fingers: the most plausible wrong place, and all that the rules' fit shows."""
+    pose = nominal_cam_T_grip()
+    image, opening_m = picture(pose)
+    frame = Frame(seq=0, stamp_ns=0, image=image, jaw_opening_m=opening_m)
+    monitor = Monitor(make_camera(PAPER_LENS), sharp_gripper(), MonitorSettings(), reference_of(pose))
+    axis = pose[:3, :3] @ monitor._tracker.finger_axis
+    slid = perturb(pose, np.concatenate([6e-3 * axis, np.zeros(3)]))
+    fit = monitor._tracker.measure_held(frame, slid, np.array([1e-6] * 3 + [1e-6] * 3))
+    assert np.linalg.norm(fit.cam_T_grip[:3, 3] - slid[:3, 3]) < 1e-3
+    shadow = Watching(monitor._camera, sharp_gripper(), monitor._tracker, reference_of(pose), MonitorSettings())
+    shadow.see(frame, fit, 0.0)
+    plain = seen_in(image, pose, opening_m)
+    both = plain.shown & shadow.seen.shown
+    assert (both == plain.shown).all()
+    nearest = np.array([np.abs(shadow.seen.lines[e, : shadow.seen.found[e], 0]).min() for e in np.flatnonzero(both)])
+    assert nearest.max() < 1.0
+    assert shadow.newest is not None and shadow.newest.known
+    assert np.linalg.norm(shadow.newest.motion[:3]) < 1e-4
 
 
 def test_records_are_the_same_with_and_without() -> None:
