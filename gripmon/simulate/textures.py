@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
-import pickle
 from collections.abc import Callable
 
 import cv2
@@ -39,18 +39,18 @@ def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: fl
     """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is roughly their contrast."""
     if strength == 0.0:
         return even(height_px, width_px)
-    out, generator = _metal(pickle.dumps(rng.bit_generator.state), height_px, width_px, px_per_m, strength)
-    rng.bit_generator.state = pickle.loads(generator)
+    out, generator = _metal(json.dumps(rng.bit_generator.state), height_px, width_px, px_per_m, strength)
+    rng.bit_generator.state = json.loads(generator)
     return out
 
 
 @functools.lru_cache(maxsize=64)
-def _metal(generator: bytes, height_px: int, width_px: int, px_per_m: float, strength: float) -> tuple[Factor, bytes]:
+def _metal(generator: str, height_px: int, width_px: int, px_per_m: float, strength: float) -> tuple[Factor, str]:
     """Many sequences show the same fingers, and a texture takes as long as half a frame.  ``generator``: the state of
     what it is drawn from, before and after.
     """
     rng = np.random.default_rng()
-    rng.bit_generator.state = pickle.loads(generator)
+    rng.bit_generator.state = json.loads(generator)
     mm = px_per_m * 1e-3
     brushed = _noise(rng, height_px, width_px, 4.0 * mm, 0.5)
     clouds = _noise(rng, height_px, width_px, 3.0 * mm, 2.0 * mm)
@@ -69,7 +69,7 @@ def _metal(generator: bytes, height_px: int, width_px: int, px_per_m: float, str
     fall_off = np.linspace(0.5, -0.5, width_px, dtype=np.float32)
     out = np.maximum(out + 0.8 * strength * fall_off, 0.2).astype(np.float32)
     out.flags.writeable = False
-    return out, pickle.dumps(rng.bit_generator.state)
+    return out, json.dumps(rng.bit_generator.state)
 
 
 def printed(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
