@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief import bound as bounds
-from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
+from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
 from gripmon.belief.rows import add_noise, fade, move
@@ -259,15 +259,14 @@ class Belief:
         and a knock is what may hide them.
         """
         bank, nodes, candidates, jumps = self._bank, self._nodes, self._candidates, self._jumps
-        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(asked.seen.shown))
+        shown = self._ends_shown(asked.seen)
         i = 1 + int(candidates.node[:n].max())
         due = math.log(max(self.priors.unseen_knock, 1e-300))
         floor = float(candidates.log_weight[:n].max()) - least - due
         made: dict[tuple[int, int], int] = {}
         for c in np.flatnonzero(candidates.log_weight[:n] > floor) if shown else ():
             h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
-            trusts = shown & ~edges_of(doubts, self._table.edges) != 0
-            if trusts or self._blind[h] or nodes.jump[candidates.node[c]] >= 0:
+            if self._trusts(doubts, shown) or self._blind[h] or nodes.jump[candidates.node[c]] >= 0:
                 continue
             for j in np.flatnonzero(jumps.knock):
                 if (h, int(j)) not in made and i < len(nodes.parent):
@@ -327,11 +326,18 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        shown = self._table.at_ends & sum(1 << int(edge) for edge in np.flatnonzero(asked.seen.shown))
-        blind = [shown & ~edges_of(int(of), self._table.edges) == 0 for of in other.doubts[: len(chosen)]]
-        self._blind = np.array(blind, bool)
+        shown = self._ends_shown(asked.seen)
+        self._blind = np.array([not self._trusts(int(of), shown) for of in other.doubts[: len(chosen)]], bool)
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
         return float(dropped)
+
+    def _ends_shown(self, seen: Seen) -> int:
+        """Bits of the edges at fingers' ends of which anything was found."""
+        return int(self._table.at_ends & bits(seen.shown))
+
+    def _trusts(self, doubts: int, ends: int) -> bool:
+        """Whether a set of doubts leaves one of the edges ``ends`` (bits)."""
+        return ends & ~edges_of(doubts, self._table.edges) != 0
 
     def _not_known(self) -> None:
         """Beside what explains nothing: the pose is anywhere a knock may have brought it."""

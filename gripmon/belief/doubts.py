@@ -103,13 +103,13 @@ class Table(NamedTuple):
         """ValueError for more doubts, or edges, than a set has bits."""
         if max(len(doubts), len(doubts[0].edges)) > MOST_DOUBTS:
             raise ValueError(f"{len(doubts)} doubts about {len(doubts[0].edges)} edges; at most {MOST_DOUBTS} of each")
-        ends = np.array([_bits([d.ends[f] for d in doubts]) for f in range(len(doubts[0].ends))], np.int64)
+        ends = np.array([bits([d.ends[f] for d in doubts]) for f in range(len(doubts[0].ends))], np.int64)
         at_ends = np.any([d.edges for d in doubts if d.ends.any()] or [np.zeros(len(doubts[0].edges), bool)], axis=0)
         rates = np.array([astuple(d.rates) for d in doubts])
         return cls(
-            np.array([_bits(d.edges) for d in doubts], np.int64), ends, _bits([d.held for d in doubts]),
-            _bits([d.fooled for d in doubts]), _bits([d.moves for d in doubts]),
-            _bits([bool(d.ends.any() and d.ends.all() and len(d.ends) > 1) for d in doubts]), _bits(at_ends), rates,
+            np.array([bits(d.edges) for d in doubts], np.int64), ends, bits([d.held for d in doubts]),
+            bits([d.fooled for d in doubts]), bits([d.moves for d in doubts]),
+            bits([bool(d.ends.any() and d.ends.all() and len(d.ends) > 1) for d in doubts]), bits(at_ends), rates,
         )  # fmt: skip
 
 
@@ -129,7 +129,7 @@ class Onsets:
     def __init__(self, table: Table) -> None:
         self._table = table
         self._alone = np.array([not (table.held >> d) & 1 for d in range(len(table.edges))])
-        self._edge = np.array([int(bits).bit_length() - 1 for bits in table.edges])  # of those alone, the only one
+        self._edge = np.array([int(of).bit_length() - 1 for of in table.edges])  # of those alone, the only one
         self._waits = np.zeros(len(table.edges))  # log probability of not having begun unseen
         self._leaves = np.zeros(len(table.edges))
         self._first = True
@@ -138,7 +138,7 @@ class Onsets:
         """Of a frame, ``dt_s`` after the last one."""
         table, first = self._table, self._first
         rates = table.rates.T
-        shown = _bits(seen.shown)
+        shown = bits(seen.shown)
         silent = self._alone & ((table.edges & shown) == 0)
         new = np.where(self._alone & ~silent, 1.0 - seen.likeness[self._edge], 0.0)
         if first:
@@ -225,5 +225,6 @@ def answered(log: float, same: bool, repeats: bool, memory: float) -> float:
     return math.log((memory if repeats else 0.0) + (1.0 - memory) * math.exp(log)) if same else log
 
 
-def _bits(flags: Sequence[bool] | Flags) -> int:
+def bits(flags: Sequence[bool] | Flags) -> int:
+    """A bit for each flag, the first the lowest."""
     return int(sum(1 << int(k) for k in np.flatnonzero(np.asarray(flags))))

@@ -190,7 +190,8 @@ def leave(nodes: Nodes, i: int, bank: Bank, h: int, seen: Seen, edge: int, sizes
     if apart:
         at[:], wide[:] = seen.searched[edge, seen.fitted[edge]], 0.0
     nodes.joint[i, edge] = fresh and apart
-    nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
+    if nodes.joint[i, edge]:
+        nodes.far[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, False, False)
     nodes.free[i, edge] = foreign(bank, h, seen, edge, fresh, False, sizes, at, wide, True, False)
     nodes.held[i, edge] = nodes.free[i, edge]
     if not fresh:

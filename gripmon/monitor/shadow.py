@@ -200,11 +200,7 @@ class Shadow:
 def _near(look: Measurement, cam_T_grip: Array) -> bool:
     """Whether a place's edges were all well within the search lines of a look."""
     there = look.prediction
-    return there.moved_px(_wide_as(there.jacobian, perturbation_between(there.cam_T_grip, cam_T_grip))) < LOOKED_PX
-
-
-def _wide_as(jacobian: Array, motion: Array) -> Array:
-    return np.concatenate([motion, np.zeros(jacobian.shape[1] - len(motion))])
+    return there.moved_px(perturbation_between(there.cam_T_grip, cam_T_grip)) < LOOKED_PX
 
 
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags]) -> list[Doubt]:
