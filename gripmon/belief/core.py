@@ -61,8 +61,8 @@ class Bound(NamedTuple):
 
 class Believed(NamedTuple):
     """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place, and their
-    ``bound``; ``dropped``, the probability that wasn't kept; ``surprise`` of the best set; ``known``: False while
-    nothing explains what is seen.
+    ``bound``; ``dropped``, the probability that this bound doesn't count: what wasn't kept, and what of the frame before
+    didn't go on; ``surprise`` of the best set; ``known``: False while nothing explains what is seen.
     """
 
     motion: Array
@@ -151,8 +151,8 @@ class Belief:
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end that was shown in the last frame
-        self._dropped, self._mean = 0.0, np.zeros(SIZE)
+        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end in the last frame, shown or not
+        self._dropped, self._left, self._mean = 0.0, 0.0, np.zeros(SIZE)
 
     @property
     def weights(self) -> dict[int, float]:
@@ -184,13 +184,11 @@ class Belief:
 
     def update(
         self, seen: Seen, dt_s: float, told: Told | None = None, *, light_memory: float = 1.0,
-        hidden_knock: float = 0.0, opening_m: float = 0.0,
+        opening_m: float = 0.0,
     ) -> Believed:  # fmt: skip
         """One frame, ``dt_s`` after the last one.  ``light_memory``: 1 while the brightness at the fingers stays, else
-        0. ``opening_m``: standard deviation of what the reported opening's error has changed by.  ``hidden_knock``:
-        probability of a knock that is due in this frame because no end is shown (policy; once for each such stretch),
-        beside that of the rate; hypotheses that begin to trust none that is shown have it in any case.  Raises
-        ValueError unless time goes on.
+        0. ``opening_m``: standard deviation of what the reported opening's error has changed by.  Raises ValueError
+        unless time goes on.
         """
         first = self._first
         if not dt_s > 0.0:
@@ -201,13 +199,14 @@ class Belief:
             fade(self._bank, h, seen)
         told = told or nothing_told(self._fingers)
         asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first, self.priors.near_px**2)
-        n = self._branch(asked, dt_s, hidden_knock)
+        n = self._branch(asked, dt_s)
         surprise = float(self._candidates.surprise[int(np.argmax(self._candidates.log_weight[:n]))])
         # A bound on the tail of chi-squared (Laurent and Massart 2000, lemma 1).
         usual = math.sqrt(2.0 * GUARD * int(seen.shown.sum())) + GUARD
         was_lost, self._lost, self._first = self._lost, not surprise <= usual, False
         if not self._lost:
-            dropped = self._keep(n, asked)
+            dropped = self._left + self._keep(n, asked)
+            self._left = float(np.sum(np.exp(self._bank.log_weight[self._hypotheses : self._listed])))
         else:  # nothing is learnt from what nothing explains
             dropped = 0.0
             if not was_lost:
@@ -232,7 +231,7 @@ class Belief:
             if factor.any():
                 add_noise(self._bank, h, self._bank.mean[h], self._bank.covariance[h], factor)
 
-    def _branch(self, asked: Asked, dt_s: float, hidden_knock: float) -> int:
+    def _branch(self, asked: Asked, dt_s: float) -> int:
         """Candidates of a frame; their number."""
         bank, nodes, candidates = self._bank, self._nodes, self._candidates
         nothing = np.zeros((0, SIZE))
@@ -246,7 +245,7 @@ class Belief:
                 n = put_all(candidates, n, nodes, h, bank, asked)
             return n
         least = -math.log(self.least)
-        n = self._jump(n, asked, dt_s, hidden_knock, least)
+        n = self._jump(n, asked, dt_s, least)
         if asked.first or self._lost:
             for h in np.argsort(-bank.log_weight[: self._hypotheses])[:AT_ONCE]:
                 n = put_pairs(candidates, n, nodes, int(h), bank, asked)
@@ -282,16 +281,20 @@ class Belief:
                 n = m
         return n
 
-    def _jump(self, n: int, asked: Asked, dt_s: float, hidden_knock: float, least: float) -> int:
-        """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light."""
+    def _jump(self, n: int, asked: Asked, dt_s: float, least: float) -> int:
+        """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light.
+        Where no end is shown, since now, a knock is as probable as policy has it.
+        """
         bank, candidates, jumps = self._bank, self._candidates, self._jumps
+        shown = self._ends_shown(asked.seen)
         stayed = candidates.log_weight[: self._hypotheses].copy()
         best = float(candidates.log_weight[:n].max())
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
+            due = 0.0 if shown or self._blind[h] else self.priors.unseen_knock
             for j in range(len(jumps.share)):
-                happens = 1.0 - (1.0 - hidden_knock * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
+                happens = 1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
                 chance = jumps.share[j] * (jumps.at_first[j] if asked.first else happens)
                 if chance <= 0.0:
                     continue

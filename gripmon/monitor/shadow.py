@@ -55,7 +55,7 @@ class Shadow:
 
     def __init__(
         self, camera: Camera, gripper: Gripper, tracker: Tracker, reference: ReferenceRecord,
-        settings: MonitorSettings, most: int = 64,
+        settings: MonitorSettings, most: int = 256,
     ) -> None:  # fmt: skip
         self._camera, self._gripper, self._tracker = camera, gripper, tracker
         self._ref_T = from_record(reference.cam_T_grip)
@@ -80,7 +80,6 @@ class Shadow:
         self._last_s: float | None = None
         self._jaw_m: float | None = None
         self._answer = np.full(len(self._ends_of), -1)
-        self._hidden = False
         self.newest: Believed | None = None
 
     @property
@@ -98,13 +97,8 @@ class Shadow:
         if seen is None:
             return
         ends = self._tracker.ends(frame, looks[0])
-        ends_shown = bool(np.any([seen.shown & own for own in self._ends_of]))
-        hidden, self._hidden = not ends_shown and not self._hidden, not ends_shown
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
-        due = self._belief.priors.unseen_knock if hidden else 0.0
-        self.newest = self._belief.update(
-            seen, dt_s, self._told(ends), hidden_knock=due, opening_m=self._opening_noise_m(frame)
-        )
+        self.newest = self._belief.update(seen, dt_s, self._told(ends), opening_m=self._opening_noise_m(frame))
         self._last_s = now_s
 
     def _opening_noise_m(self, frame: Frame) -> float:
@@ -168,7 +162,8 @@ class Shadow:
                 image_white[edge, k] = line.image_px2
             if of:
                 texture = TEXTURE_PX * _texture(beside, edge, noise)
-                strength[edge] = (texture / max(abs(of[0].step), 1.0)) ** 2 / of[0].points + self._floor_px**2
+                texture /= max(abs(of[0].step), 1.0) * math.sqrt(of[0].points)
+                strength[edge] = min(texture, self._belief.priors.near_px) ** 2 + self._floor_px**2
                 asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0

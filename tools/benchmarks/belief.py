@@ -72,14 +72,11 @@ def run(seed: int, setup: Setup) -> Run:
     )
     beyond, available, frames = np.zeros(len(RISKS), int), np.zeros(len(RISKS), int), 0
     errors, bounds, dropped, cpu = [], [], [], []
-    hidden = False
     for t in range(FRAMES):
         sample = world.frame()
         start = time.thread_time()
-        was_hidden, hidden = hidden, not sample.seen.shown[~world.view.along].any()
         believed = belief.update(
             sample.seen, DT_S, sample.told, light_memory=sample.light_memory,
-            hidden_knock=setup.priors.unseen_knock if hidden and not was_hidden else 0.0,
         )  # fmt: skip
         cpu.append(time.thread_time() - start)
         if t < world.at:
