@@ -129,7 +129,7 @@ class Belief:
 
     def __init__(
         self, doubts: Sequence[Doubt], along: Array, priors: Priors | None = None, *, risk: float = 1e-5,
-        most: int = 64, backgrounds: int = 1, everything: bool = False, searching: bool = True,
+        most: int = 256, backgrounds: int = 1, everything: bool = False, searching: bool = True,
         covariance: Array | None = None,
     ) -> None:  # fmt: skip
         self.priors, self.risk, self.most = priors or Priors(), risk, most

@@ -55,7 +55,7 @@ class Shadow:
 
     def __init__(
         self, camera: Camera, gripper: Gripper, tracker: Tracker, reference: ReferenceRecord,
-        settings: MonitorSettings, most: int = 256,
+        settings: MonitorSettings,
     ) -> None:  # fmt: skip
         self._camera, self._gripper, self._tracker = camera, gripper, tracker
         self._ref_T = from_record(reference.cam_T_grip)
@@ -72,7 +72,7 @@ class Shadow:
         ]
         self._belief = Belief(
             doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors,
-            risk=settings.policy.integrity_risk, most=most, covariance=covariance,
+            risk=settings.policy.integrity_risk, covariance=covariance,
         )  # fmt: skip
         self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, when it was seen last
         self._floor_px = settings.corners.consensus.edge_floor_px  # what averaging along an edge doesn't remove

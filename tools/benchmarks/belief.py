@@ -47,7 +47,7 @@ class Setup:
     differs: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
     searching: bool = True
-    most: int = 64
+    most: int = 256
 
 
 class Run(NamedTuple):
@@ -75,9 +75,7 @@ def run(seed: int, setup: Setup) -> Run:
     for t in range(FRAMES):
         sample = world.frame()
         start = time.thread_time()
-        believed = belief.update(
-            sample.seen, DT_S, sample.told, light_memory=sample.light_memory,
-        )  # fmt: skip
+        believed = belief.update(sample.seen, DT_S, sample.told, light_memory=sample.light_memory)
         cpu.append(time.thread_time() - start)
         if t < world.at:
             continue
@@ -194,7 +192,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--runs", type=int, default=60, help="without a rare fault; a sixth of them with each (default 60)"
     )
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--most", type=int, default=64, help="hypotheses kept (default 64)")
+    parser.add_argument("--most", type=int, default=256, help="hypotheses kept (default 256)")
     parser.add_argument("--world", choices=("own", "second", *SECOND), default="own")
     parser.add_argument("--search-off", action="store_true", help="without the search")
     what = parser.add_mutually_exclusive_group(required=True)
