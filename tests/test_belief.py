@@ -412,26 +412,49 @@ def test_a_mount_that_creeps_fast_is_followed_as_one_that_is_loose() -> None:
     assert sum(weight for doubts, weight in belief.weights.items() if doubts >> 8 & 1) > 0.9
 
 
-def test_who_stops_trusting_the_ends_expects_a_knock_at_once() -> None:
-    """Ends that turn into something else's in a frame: what hides them is what knocks, and the edges along the fingers
-    don't see it.
+@pytest.mark.parametrize("hidden", [False, True])
+def test_who_stops_trusting_the_ends_expects_a_knock_at_once_and_once(hidden: bool) -> None:
+    """Ends that turn into something else's in a frame, or that are hidden from it on: what hides them is what knocks,
+    and the edges along the fingers don't see it.
     """
-    bounds_m = {}
+    beyond = {}
     for unseen_knock in (1e-3, 0.0):
         rng, edges = np.random.default_rng(4), 8
-        frames = frames_of(rng, edges, 8, 0.3, clean=True)
+        priors = replace(STEADY, reference=(1e-9,) * 6, knock_per_s=1e-15, small_per_s=1e-15, unseen_knock=unseen_knock)
+        frames = frames_of(rng, edges, 12, 0.3, clean=True, priors=priors)
         ends = np.arange(edges) >= 5
         along = np.array([0.0, 0.0, 1.0])
         for frame in frames:
             frame.seen.rows[~ends, ..., 2] = frame.seen.rows[~ends, ..., 14] = 0.0  # they don't see the fingers' way
         for frame in frames[4:]:
             frame.seen.lines[ends, 0] += rng.normal(0.0, 5.0, (ends.sum(), 2))
+            frame.seen.found[ends] = 0 if hidden else 1
         doubts = [*of_edges(edges, 1), *of_ends([ends])]
-        belief = Belief(doubts, along, replace(STEADY, unseen_knock=unseen_knock, knock_per_s=1e-15, small_per_s=1e-15))
-        bounds_m[unseen_knock] = [belief.update(frame.seen, DT_S).bound.position_m for frame in frames]
-        assert bounds_m[unseen_knock][3] < 1e-4
-    assert bounds_m[1e-3][4] > 3e-3
-    assert bounds_m[0.0][4] < 1e-3
+        belief = Belief(doubts, along, priors)
+        beyond[unseen_knock] = []
+        for frame in frames:
+            believed = belief.update(frame.seen, DT_S)
+            bank, n = belief._bank, belief._hypotheses
+            away = np.sqrt(bank.covariance[:n, 2, 2]) > 1e-3
+            beyond[unseen_knock].append((believed.bound.position_m, float(np.exp(bank.log_weight[:n][away]).sum())))
+        assert beyond[unseen_knock][3][0] < 1e-4
+    assert beyond[1e-3][4][0] > 3e-3
+    assert beyond[0.0][4][0] < 1e-3
+    if hidden:  # nothing tells of one along the fingers: it is as probable as policy has it, however long ends are away
+        assert [weight for _, weight in beyond[1e-3][4:]] == pytest.approx([1e-3 / 3.0] * 8, rel=0.05)
+
+
+def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
+    """A filter that keeps two hypotheses, where the mount may have jumped in seven ways while no end is shown."""
+    frames = frames_of(np.random.default_rng(6), 8, 2, 0.3, clean=True)
+    for frame in frames:
+        frame.seen.found[:] = 0
+    doubts = [*of_edges(8, 1), *of_ends([np.arange(8) >= 5])]
+    few, many = (Belief(doubts, ALONG, Priors(), most=most) for most in (2, 256))
+    first, second = ([belief.update(frame.seen, DT_S) for belief in (few, many)] for frame in frames)
+    assert max(believed.dropped for believed in first) < 1e-6
+    assert second[0].dropped > 1e-4 > 1e-6 > second[1].dropped
+    assert np.isinf(second[0].bound.position_m) and np.isfinite(second[1].bound.position_m)
 
 
 def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:

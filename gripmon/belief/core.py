@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief import bound as bounds
-from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
+from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
 from gripmon.belief.rows import add_noise, fade, move
@@ -29,6 +29,7 @@ from gripmon.belief.state import (
     REFERENCE,
     SIZE,
     Bank,
+    Flags,
     Ints,
     Priors,
     Seen,
@@ -61,7 +62,7 @@ class Bound(NamedTuple):
 
 class Believed(NamedTuple):
     """After a frame: ``motion`` (6,) since the reference and ``reference_error`` (6,), of the heaviest place, and their
-    ``bound``; ``dropped``, the probability that this bound doesn't count: what wasn't kept, and what of the frame before
+    ``bound``; ``dropped``, the probability that it doesn't count: what wasn't kept, and what of the frame before
     didn't go on; ``surprise`` of the best set; ``known``: False while nothing explains what is seen.
     """
 
@@ -151,7 +152,7 @@ class Belief:
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end in the last frame, shown or not
+        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end in the last frame
         self._dropped, self._left, self._mean = 0.0, 0.0, np.zeros(SIZE)
 
     @property
@@ -251,21 +252,21 @@ class Belief:
                 n = put_pairs(candidates, n, nodes, int(h), bank, asked)
         reach = -math.log(0.3 * self.risk)
         n = int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
-        return n if asked.first else self._knock_unseen(n, asked, least)
+        return self._knock_unseen(n, asked, least)
 
     def _knock_unseen(self, n: int, asked: Asked, least: float) -> int:
-        """Sets that trust no end that is shown, since now, also after each knock: what hides the ends is what knocks,
-        and a knock is what may hide them.
+        """Sets that trust no end, since now, also after each knock: what hides the ends is what knocks, and a knock is
+        what may hide them.
         """
         bank, nodes, candidates, jumps = self._bank, self._nodes, self._candidates, self._jumps
-        shown = self._ends_shown(asked.seen)
+        sharp = self._sharp_ends(asked.seen)
         i = 1 + int(candidates.node[:n].max())
         due = math.log(max(self.priors.unseen_knock, 1e-300))
         floor = float(candidates.log_weight[:n].max()) - least - due
         made: dict[tuple[int, int], int] = {}
-        for c in np.flatnonzero(candidates.log_weight[:n] > floor) if shown else ():
+        for c in np.flatnonzero(candidates.log_weight[:n] > floor) if sharp.any() else ():
             h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
-            if self._trusts(doubts, shown) or self._blind[h] or nodes.jump[candidates.node[c]] >= 0:
+            if self._blind[h] or nodes.jump[candidates.node[c]] >= 0 or self._trusts(int(c), sharp):
                 continue
             for j in np.flatnonzero(jumps.knock):
                 if (h, int(j)) not in made and i < len(nodes.parent):
@@ -283,19 +284,19 @@ class Belief:
 
     def _jump(self, n: int, asked: Asked, dt_s: float, least: float) -> int:
         """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light.
-        Where no end is shown, since now, a knock is as probable as policy has it.
+        Where no end is seen, since now, a knock is as probable as policy has it.
         """
         bank, candidates, jumps = self._bank, self._candidates, self._jumps
-        shown = self._ends_shown(asked.seen)
+        ends_seen = self._table.at_ends == 0 or bool(self._sharp_ends(asked.seen).any())
         stayed = candidates.log_weight[: self._hypotheses].copy()
         best = float(candidates.log_weight[:n].max())
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
-            due = 0.0 if shown or self._blind[h] else self.priors.unseen_knock
+            due = 0.0 if ends_seen or self._blind[h] else self.priors.unseen_knock
             for j in range(len(jumps.share)):
-                happens = 1.0 - (1.0 - due * jumps.knock[j]) * math.exp(-jumps.per_s[j] * dt_s)
-                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else happens)
+                not_else = 1.0 - jumps.at_first[j] if asked.first else math.exp(-jumps.per_s[j] * dt_s)
+                chance = jumps.share[j] * (1.0 - (1.0 - due * jumps.knock[j]) * not_else)
                 if chance <= 0.0:
                     continue
                 log = math.log(chance)
@@ -329,18 +330,21 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        shown = self._ends_shown(asked.seen)
-        self._blind = np.array([not self._trusts(int(of), shown) for of in other.doubts[: len(chosen)]], bool)
+        sharp = self._sharp_ends(asked.seen)
+        self._blind = np.array([not self._trusts(int(c), sharp) for c in chosen], bool)
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
         return float(dropped)
 
-    def _ends_shown(self, seen: Seen) -> int:
-        """Bits of the edges at fingers' ends of which anything was found."""
-        return int(self._table.at_ends & bits(seen.shown))
+    def _sharp_ends(self, seen: Seen) -> Flags:
+        """(e,) whether an edge at a finger's end is seen better than to an edge's width; else it doesn't tell of it."""
+        edges = np.array([bool((self._table.at_ends >> e) & 1) for e in range(self._edges)])
+        return edges & seen.shown & (seen.strength + seen.white[:, 0, 0] < self.priors.near_px**2)
 
-    def _trusts(self, doubts: int, ends: int) -> bool:
-        """Whether a set of doubts leaves one of the edges ``ends`` (bits)."""
-        return ends & ~edges_of(doubts, self._table.edges) != 0
+    def _trusts(self, c: int, ends: Flags) -> bool:
+        """Whether a candidate takes one of the edges ``ends`` (e,) for the gripper's, and a line there for it."""
+        doubted = edges_of(int(self._candidates.doubts[c]), self._table.edges)
+        own = self._nodes.line[self._candidates.node[c]] >= 0
+        return any(not (doubted >> e) & 1 for e in np.flatnonzero(ends & own))
 
     def _not_known(self) -> None:
         """Beside what explains nothing: the pose is anywhere a knock may have brought it."""

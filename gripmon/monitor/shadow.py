@@ -138,7 +138,7 @@ class Shadow:
         return [looks[main], *looks[:main], *looks[main + 1 :]]
 
     def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
-        """The frame's edges, of several looks at it; None with too few of them."""
+        """The frame's edges, of several looks at it; None with none of them."""
         main, edges = looks[0], len(self._gripper.edge_ids)
         assert isinstance(frame.image, np.ndarray)
         beside, noise = _beside(frame.image, main, edges), main.candidates.noise / math.sqrt(3.0)  # of three pixels
@@ -162,12 +162,11 @@ class Shadow:
                 image_white[edge, k] = line.image_px2
             if of:
                 texture = TEXTURE_PX * _texture(beside, edge, noise)
-                texture /= max(abs(of[0].step), 1.0) * math.sqrt(of[0].points)
-                strength[edge] = min(texture, self._belief.priors.near_px) ** 2 + self._floor_px**2
+                strength[edge] = (texture / max(abs(of[0].step), 1.0)) ** 2 / of[0].points + self._floor_px**2
                 asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0
-        if np.count_nonzero(shown) < 3:
+        if not shown.any():
             return None
         likeness = np.array([_likeness(beside[e], self._beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         self._beside = np.where(shown[:, None, None], beside, self._beside)
