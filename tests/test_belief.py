@@ -440,8 +440,9 @@ def test_who_stops_trusting_the_ends_expects_a_knock_at_once_and_once(hidden: bo
         assert beyond[unseen_knock][3][0] < 1e-4
     assert beyond[1e-3][4][0] > 3e-3
     assert beyond[0.0][4][0] < 1e-3
-    if hidden:  # nothing tells of one along the fingers: it is as probable as policy has it, however long ends are away
-        assert [weight for _, weight in beyond[1e-3][4:]] == pytest.approx([1e-3 / 3.0] * 8, rel=0.05)
+    if hidden:  # it stays as probable as policy has it, one along the fingers at least, however long the ends are away
+        assert beyond[1e-3][4][1] == pytest.approx(1e-3, rel=0.05)
+        assert all(0.9e-3 / 3.0 < weight < 1.05e-3 for _, weight in beyond[1e-3][5:])
 
 
 def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
@@ -452,8 +453,8 @@ def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
     doubts = [*of_edges(8, 1), *of_ends([np.arange(8) >= 5])]
     few, many = (Belief(doubts, ALONG, Priors(), most=most) for most in (2, 256))
     first, second = ([belief.update(frame.seen, DT_S) for belief in (few, many)] for frame in frames)
-    assert max(believed.dropped for believed in first) < 1e-6
-    assert second[0].dropped > 1e-4 > 1e-6 > second[1].dropped
+    assert max(believed.dropped for believed in first) < 2e-6
+    assert second[0].dropped > 1e-4 > 2e-6 > second[1].dropped
     assert np.isinf(second[0].bound.position_m) and np.isfinite(second[1].bound.position_m)
 
 

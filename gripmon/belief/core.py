@@ -41,6 +41,8 @@ GUARD = 20.0
 NOT_KNOWN_WEIGHT = 0.1
 """Of the hypothesis that the pose isn't known, while the guard stops: policy."""
 _MOST_CANDIDATES = 4096
+_OF_SIZES = 10.0
+"""Into how many parts a knock falls by its size and way; the smallest is a twentieth."""
 _MOST_LISTED = 256
 """Hypotheses of one frame that count in its bound and don't go on."""
 
@@ -145,14 +147,15 @@ class Belief:
         kept = _MOST_CANDIDATES if everything else most + 1
         listed = kept if everything else kept + _MOST_LISTED
         self._bank, self._other = (Bank.empty(listed, self._edges, backgrounds) for _ in range(2))
-        nodes = kept * (1 if everything else 1 + len(self._jumps.share))
+        nodes = kept * (1 if everything else 1 + 2 * len(self._jumps.share))
         self._nodes = Nodes.empty(nodes, self._edges, len(doubts), self._fingers)
         self._candidates = Candidates.empty(kept * 4 if everything else _MOST_CANDIDATES)
         self._bank.covariance[0] = self.priors.covariance() if covariance is None else covariance
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._blind = np.zeros(1, bool)  # of each hypothesis: it trusted no end in the last frame
+        self._of_ends = int(np.bitwise_or.reduce(self._table.ends)) if len(self._table.ends) else 0
+        self._weighed = np.zeros(1, bool)  # of each hypothesis: it sees no end, and a knock since is weighed beside it
         self._dropped, self._left, self._mean = 0.0, 0.0, np.zeros(SIZE)
 
     @property
@@ -252,51 +255,52 @@ class Belief:
                 n = put_pairs(candidates, n, nodes, int(h), bank, asked)
         reach = -math.log(0.3 * self.risk)
         n = int(search(candidates, n, nodes, bank, asked, reach, least)) if self._searching else n
-        return self._knock_unseen(n, asked, least)
+        return self._knock_unseen(n, asked)
 
-    def _knock_unseen(self, n: int, asked: Asked, least: float) -> int:
-        """Sets that trust no end, since now, also after each knock: what hides the ends is what knocks, and a knock is
-        what may hide them.
+    def _knock_unseen(self, n: int, asked: Asked) -> int:
+        """Sets that see no end, as soon as they matter, also after each knock: what hides the ends is what knocks, and
+        a knock is what may hide them.
         """
-        bank, nodes, candidates, jumps = self._bank, self._nodes, self._candidates, self._jumps
-        sharp = self._sharp_ends(asked.seen)
-        i = 1 + int(candidates.node[:n].max())
+        nodes, candidates, jumps = self._nodes, self._candidates, self._jumps
+        self._just_weighed = np.zeros(len(candidates.node), bool)
+        ends, i, made = self._ends_seen(asked.seen), 1 + int(candidates.node[:n].max()), dict[tuple[int, int], int]()
         due = math.log(max(self.priors.unseen_knock, 1e-300))
-        floor = float(candidates.log_weight[:n].max()) - least - due
-        made: dict[tuple[int, int], int] = {}
-        for c in np.flatnonzero(candidates.log_weight[:n] > floor) if sharp.any() else ():
+        floor = float(candidates.log_weight[:n].max()) + math.log(self.least) - due + math.log(_OF_SIZES)
+        for c in np.flatnonzero(candidates.log_weight[:n] > floor) if self._table.at_ends else ():
             h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
-            if self._blind[h] or nodes.jump[candidates.node[c]] >= 0 or self._trusts(int(c), sharp):
+            if self._is_weighed(int(c)) or nodes.jump[candidates.node[c]] >= 0 or self._sees(int(c), ends):
                 continue
+            self._just_weighed[c] = True
             for j in np.flatnonzero(jumps.knock):
-                if (h, int(j)) not in made and i < len(nodes.parent):
-                    factor = jumps.factors[j, : jumps.ranks[j]]
-                    self._node(i, h, int(j), float(bank.log_weight[h] + due + math.log(jumps.share[j])), factor, asked)
-                    made[h, int(j)], i = i, i + 1
+                log = due + math.log(jumps.share[j])
                 if (h, int(j)) not in made:
-                    continue
-                m = put(candidates, n, nodes, made[h, int(j)], doubts, bank, asked)
+                    factor = jumps.factors[j, : jumps.ranks[j]]
+                    self._node(i, h, int(j), float(self._bank.log_weight[h]) + log, factor, asked)
+                    made[h, int(j)], i = i, i + 1
+                m = put(candidates, n, nodes, made[h, int(j)], doubts, self._bank, asked)
                 if m > n:  # policy, whatever the ends that aren't trusted say of it
-                    floor_of = candidates.log_weight[c] + due + math.log(jumps.share[j])
-                    candidates.log_weight[n] = max(candidates.log_weight[n], floor_of)
+                    candidates.log_weight[n] = max(candidates.log_weight[n], candidates.log_weight[c] + log)
+                else:
+                    self._just_weighed[c] = False
                 n = m
         return n
 
+    def _is_weighed(self, c: int) -> bool:
+        """Whether a candidate's parent saw no end either, doubted the same ends, and a knock was weighed beside it."""
+        h = int(self._nodes.parent[self._candidates.node[c]])
+        changed = int(self._bank.doubts[h]) ^ int(self._candidates.doubts[c])
+        return bool(self._weighed[h]) and not changed & self._of_ends
+
     def _jump(self, n: int, asked: Asked, dt_s: float, least: float) -> int:
-        """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light.
-        Where no end is seen, since now, a knock is as probable as policy has it.
-        """
+        """Each hypothesis after each jump that may matter: whose prior, with what it could explain, isn't too light."""
         bank, candidates, jumps = self._bank, self._candidates, self._jumps
-        ends_seen = self._table.at_ends == 0 or bool(self._sharp_ends(asked.seen).any())
         stayed = candidates.log_weight[: self._hypotheses].copy()
         best = float(candidates.log_weight[:n].max())
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
-            due = 0.0 if ends_seen or self._blind[h] else self.priors.unseen_knock
             for j in range(len(jumps.share)):
-                not_else = 1.0 - jumps.at_first[j] if asked.first else math.exp(-jumps.per_s[j] * dt_s)
-                chance = jumps.share[j] * (1.0 - (1.0 - due * jumps.knock[j]) * not_else)
+                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-jumps.per_s[j] * dt_s))
                 if chance <= 0.0:
                     continue
                 log = math.log(chance)
@@ -330,17 +334,29 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        sharp = self._sharp_ends(asked.seen)
-        self._blind = np.array([not self._trusts(int(c), sharp) for c in chosen], bool)
+        owed = self._owed(chosen, other.log_weight, self._ends_seen(asked.seen))
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
-        return float(dropped)
+        return float(dropped) + owed
 
-    def _sharp_ends(self, seen: Seen) -> Flags:
+    def _owed(self, chosen: Ints, log_weight: Array, ends: Flags) -> float:
+        """Probability of a knock that isn't weighed beside hypotheses that see no end: they were too light for it."""
+        nodes, candidates = self._nodes, self._candidates
+        weighed, owed = np.zeros(len(chosen), bool), 0.0
+        for q, c in enumerate(chosen) if self._table.at_ends and not self._everything else ():
+            jump = nodes.jump[candidates.node[c]]
+            if not self._sees(int(c), ends):
+                knocked = jump >= 0 and self._jumps.knock[jump]
+                weighed[q] = knocked or self._is_weighed(int(c)) or self._just_weighed[c]
+                owed += 0.0 if weighed[q] else math.exp(log_weight[q]) * self.priors.unseen_knock
+        self._weighed = weighed
+        return owed
+
+    def _ends_seen(self, seen: Seen) -> Flags:
         """(e,) whether an edge at a finger's end is seen better than to an edge's width; else it doesn't tell of it."""
         edges = np.array([bool((self._table.at_ends >> e) & 1) for e in range(self._edges)])
         return edges & seen.shown & (seen.strength + seen.white[:, 0, 0] < self.priors.near_px**2)
 
-    def _trusts(self, c: int, ends: Flags) -> bool:
+    def _sees(self, c: int, ends: Flags) -> bool:
         """Whether a candidate takes one of the edges ``ends`` (e,) for the gripper's, and a line there for it."""
         doubted = edges_of(int(self._candidates.doubts[c]), self._table.edges)
         own = self._nodes.line[self._candidates.node[c]] >= 0
@@ -359,7 +375,7 @@ class Belief:
         bank.log_weight[:n] += math.log(1.0 - NOT_KNOWN_WEIGHT)
         bank.log_weight[n] = math.log(NOT_KNOWN_WEIGHT)
         self._hypotheses = self._listed = n + 1
-        self._blind = np.append(self._blind[:n], self._blind[h])
+        self._weighed = np.append(self._weighed[:n], self._weighed[h])
 
     def _believed(self, dropped: float, surprise: float) -> Believed:
         bank, n, mean = self._bank, self._listed, np.empty(SIZE)

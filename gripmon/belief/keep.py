@@ -80,9 +80,10 @@ def keep(
     most: int, least: float, merging: bool,
 ) -> tuple[Ints, int, float]:  # fmt: skip
     """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, none lighter than ``least``, by
-    moments where two are the same (``merging``).  At most ``most`` go on: beyond these what says the same of the place
-    is one of them whatever it doubts, and what says something else is listed behind them, for this frame's bound alone.
-    Which candidate gives each its rows (k,), how many are listed, and the probability that is in none.
+    moments where two are the same (``merging``).  At most ``most`` go on, of one place a quarter of them: beyond these
+    what says the same of the place is one of them whatever it doubts, and what says something else is listed behind
+    them, for this frame's bound alone.  Which candidate gives each its rows (k,), how many are listed, and the
+    probability that is in none.
     """
     order = np.argsort(-candidates.log_weight[:n])
     top, total = candidates.log_weight[order[0]], 0.0
@@ -90,7 +91,7 @@ def keep(
         total += math.exp(candidates.log_weight[c] - top)
     chosen, listed, lost = np.empty(min(most, n), np.int64), 0, 0.0
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
-    rest = 1.0
+    rest, there = 1.0, np.zeros(len(into.doubts), np.int64)  # how many say the place that one is the first to say
     for c in order:
         weight = math.exp(candidates.log_weight[c] - top) / total
         if weight < least or (merging and listed > 0 and rest < REST * least):
@@ -102,18 +103,22 @@ def keep(
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
         posterior(nodes, i, seen, doubted, held, near, mean, covariance)
-        twin = -1
+        twin, first = -1, -1
         for q in range(listed if merging else 0):
-            if listed < most and not same_doubts(into.doubts[q], doubts, table):
+            alike = same_doubts(into.doubts[q], doubts, table)
+            if not alike and (first >= 0 or there[q] == 0):
                 continue
             if same_place(into.mean[q], into.covariance[q], mean, covariance):
-                twin = q
-                break
+                first = q if first < 0 and there[q] > 0 else first
+                if alike or listed >= most or there[first] >= most // 4:
+                    twin = q
+                    break
         if twin >= 0:
             merge(into, twin, weight, mean, covariance)
         elif listed < len(into.doubts):
             if listed < most:
                 chosen[listed] = c
+            there[first if first >= 0 else listed] += 1
             into.doubts[listed], into.log_weight[listed] = doubts, weight
             for j in range(SIZE):
                 into.mean[listed, j] = mean[j]
