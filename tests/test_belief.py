@@ -19,7 +19,7 @@ from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 DT_S = 1.0 / 15.0
-STEADY = replace(Priors(), creep_m_s=0.0, creep_rad_s=0.0, another=0.0, aligned=0.0, missed=0.0)
+STEADY = replace(Priors(), creep_m_s=0.0, creep_rad_s=0.0, aligned=0.0, missed=0.0)
 SURE = replace(STEADY, reference=(5e-5,) * 3 + (1e-3,) * 3, opening_m=5e-5, length_m=5e-5)
 """A reference that tells each edge's place to less than a pixel."""
 ALONG = np.array([0.0, 0.6, 0.8])
@@ -270,6 +270,17 @@ def test_an_edge_that_lies_still_beside_its_place_speaks_once() -> None:
     assert max(odds) - min(odds) < 3.0
 
 
+def test_a_picture_that_stays_tells_no_more_with_every_frame() -> None:
+    """Lines are missed of the gripper and of what may be held alike: nothing is doubted only because time goes by."""
+    priors = replace(STEADY, missed=0.05)
+    held = [Doubt(np.arange(8) >= 4, Rates(1e-2, 1e-6, leaves_per_s=1e-6), np.zeros(1, bool))]
+    belief, doubted = Belief([*of_edges(8, 1), *held], ALONG, priors), []
+    for frame in frames_of(np.random.default_rng(5), 8, 90, 0.999, clean=True, priors=priors):
+        belief.update(frame.seen, DT_S)
+        doubted.append(sum(weight for doubts, weight in belief.weights.items() if doubts >> 8 & 1))
+    assert 0.2 < doubted[-1] / doubted[9] < 5.0
+
+
 @pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.5, 0.0), (0.8, 0.8), (0.95, 0.95), (0.95, 0.3), (1.0, 1.0)])
 def test_the_tail_of_an_error_in_three_dimensions_is_no_less_than_it_is(sigmas: tuple[float, float]) -> None:
     """Against quadrature over the two shorter axes, a sigma of the longest being 1."""
@@ -442,7 +453,7 @@ def test_who_stops_trusting_the_ends_expects_a_knock_at_once_and_once(hidden: bo
     assert beyond[0.0][4][0] < 1e-3
     if hidden:  # it stays as probable as policy has it, one along the fingers at least, however long the ends are away
         assert beyond[1e-3][4][1] == pytest.approx(1e-3, rel=0.05)
-        assert all(0.9e-3 / 3.0 < weight < 1.05e-3 for _, weight in beyond[1e-3][5:])
+        assert all(0.9e-3 / 3.0 < weight < 2e-3 for _, weight in beyond[1e-3][5:])
 
 
 def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:

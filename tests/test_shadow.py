@@ -110,6 +110,19 @@ def test_pictures_are_alike_but_for_gain_and_noise() -> None:
     assert _alike(picture + rng.normal(0.0, 4.0, 12), picture, 0.5) <= 0.98
 
 
+def test_a_background_that_creeps_is_another_one_in_the_end() -> None:
+    """0.2 of a place a frame: no two frames differ by more than their noise, the first and the tenth do."""
+    rng = np.random.default_rng(4)
+    wide, at = np.cumsum(rng.normal(0.0, 1.0, 400)) + 120.0, np.arange(12.0) * 4.0
+    creeping, still = ([np.interp(at + k * step, np.arange(400), wide) for k in range(40)] for step in (0.2, 0.0))
+    for pictures, least, most in ((still, 0.95, 1.0), (creeping, 0.0, 0.7)):
+        shadow = Shadow.__new__(Shadow)
+        shadow._beside, shadow._like = np.full((1, 2, 12), np.nan), np.zeros(1)
+        likes = [shadow._compare(0, np.array([p, p]) + rng.normal(0.0, 0.3, (2, 12)), 0.3) for p in pictures]
+        assert likes[0] == 0.0
+        assert least <= np.prod(likes[1:]) <= most
+
+
 def test_texture_is_the_scatter_without_noise_and_shading() -> None:
     rng = np.random.default_rng(5)
     found = []

@@ -206,7 +206,7 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
 
     Where it is known to less than lines lie apart, the fit chooses, as for all edges together.
     """
-    count, far, missed = seen.found[edge], sizes[1], sizes[4]
+    count, far, missed = seen.found[edge], sizes[1], sizes[2]
     log, any_of, best, most = -math.log(count), 0.0, -1, -math.inf
     for of in range(count):
         near, anything = 0.0, 0.0
@@ -230,7 +230,7 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
     """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
     fingers were longer or shorter by one length, each but for an edge's width.
     """
-    near, another, share, across = sizes[0], sizes[2], sizes[3], sizes[5]
+    near, another, share, across = sizes[0], sizes[2], sizes[3], sizes[4]
     before = bank.doubts[nodes.parent[i]]
     for k in range(len(table.edges)):
         nodes.across[i, k] = 0.0

@@ -57,10 +57,10 @@ class Priors:
     Of the reference's error b (6,), m and rad; of the jaw opening and the finger lengths, m; of the light, px; of the
     focal length, relative, over hours (a lens that warms).  ``lasting_px``: how far off an edge of the gripper file is
     for good.  ``near_px`` and ``far_px``: where another thing's edge is found, by the width of an edge and by the reach
-    of the search; ``another``: probability that the next search finds another one of that thing; ``aligned``: share of
-    what lies over fingers' ends that is straight across them, at ``across_m`` from these along the fingers (half of the
-    search's reach); ``missed``: probability that an edge of the gripper isn't
-    among the lines that were found there.  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
+    of the search; ``aligned``: share of what lies over fingers' ends that is straight across them, at ``across_m`` from
+    these along the fingers (half of the search's reach); ``missed``: probability that an edge, of the gripper or of
+    another thing, isn't among the lines that were found there (the same for both: else a picture that stays tells more
+    with every frame).  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
     in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a
     second's square root while it is loose.
     ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
@@ -77,7 +77,6 @@ class Priors:
     lasting_px: float = 0.05
     near_px: float = 0.5
     far_px: float = 7.0
-    another: float = 0.01
     aligned: float = 0.5
     across_m: float = 6e-3
     missed: float = 0.05

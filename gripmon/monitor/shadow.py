@@ -41,6 +41,8 @@ right lines of 33 simulated scenes were within 0.3 to 0.6 px, 68 % within 0.15 (
 STILL_NOISES = 1.5
 """Difference of two pictures, in units of what their noise makes of it, up to which nothing has changed."""
 LIKE_STILL, MOST_LIKE = 0.999, 0.98
+ANOTHER = 0.5
+"""Likeness under which a background is another one; different stills reach it in a tenth of the pairs, at most."""
 RIGHT, WRONG = np.array([0.155, 0.276, 0.569]), np.array([0.812, 0.117, 0.071])
 """How probable 0, 1 or 2 indications of a finger's end are where it is one and where it is something else, of one of
 several fingers in view.  These tables: 1,518 right fits and 524 that had slid (``tools/bench belief --witnesses``).
@@ -78,7 +80,8 @@ class Shadow:
             doubts_of(gripper, tracker.along, self._ends_of), self._axis, priors,
             risk=settings.policy.integrity_risk, covariance=covariance,
         )  # fmt: skip
-        self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, when it was seen last
+        self._beside = np.full((len(gripper.edge_ids), 2, BESIDE_POINTS), np.nan)  # of each edge, before a background
+        self._like = np.zeros(len(gripper.edge_ids))  # how like that is to what was seen of the edge last
         self._floor_px = settings.corners.consensus.edge_floor_px  # what averaging along an edge doesn't remove
         self._frames: dict[int, Frame2d] = {}
         self._last_s: float | None = None
@@ -173,12 +176,21 @@ class Shadow:
         shown = count > 0
         if not shown.any():
             return None
-        likeness = np.array([_likeness(beside[e], self._beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
-        self._beside = np.where(shown[:, None, None], beside, self._beside)
+        likeness = np.array([self._compare(e, beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         background = np.zeros(edges, np.int64)
         return Seen(
             rows, lines, white, searched, image, image_white, count, fitted, background, likeness, strength, asked
         )  # fmt: skip
+
+    def _compare(self, edge: int, now: Array, noise: float) -> float:
+        """How like a picture (2, p) of an edge's sides is to that of it seen last; by how both are like the one with
+        which its background began, else what creeps is taken for still.
+        """
+        like, before = _likeness(now, self._beside[edge], noise), self._like[edge]
+        self._like[edge] = like
+        if like < ANOTHER:
+            self._beside[edge], self._like[edge] = now, LIKE_STILL
+        return like if like == before == LIKE_STILL else min(like / max(before, ANOTHER), MOST_LIKE)
 
     def _columns(self, measurement: Measurement) -> Array:
         """(n, 23): how each search line's offset changes with g, at the present pose."""
