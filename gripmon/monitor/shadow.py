@@ -26,6 +26,8 @@ from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, FingerEndsSeen, Measurem
 from gripmon.track.edges.profiles import read_profiles
 
 MOST_PLACES = 3
+FEWEST_EDGES = 3
+"""Edges below which a frame says nothing: two straight ones leave two of six directions open, whatever they are."""
 SETTLES_M, SETTLES_RAD = 0.3e-3, 3e-3
 """How far a fit goes from a place at which it starts, beside what isn't known of that: that of a small motion."""
 BESIDE_PX, BESIDE_POINTS = 6.0, 12
@@ -145,7 +147,7 @@ class Shadow:
         return [looks[main], *looks[:main], *looks[main + 1 :]]
 
     def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
-        """The frame's edges, of several looks at it; None with none of them."""
+        """The frame's edges, of several looks at it; None with too few of them."""
         main, edges = looks[0], len(self._gripper.edge_ids)
         assert isinstance(frame.image, np.ndarray)
         beside, noise = _beside(frame.image, main, edges), main.candidates.noise / math.sqrt(3.0)  # of three pixels
@@ -174,7 +176,7 @@ class Shadow:
                 asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0
-        if not shown.any():
+        if np.count_nonzero(shown) < FEWEST_EDGES:
             return None
         likeness = np.array([self._compare(e, beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         background = np.zeros(edges, np.int64)
