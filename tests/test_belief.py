@@ -14,6 +14,8 @@ from support.belief_paths import sum_of_paths
 from gripmon.belief import bound
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import Doubt, Rates, Table, Told, log_told, of_edges, of_ends, of_mount
+from gripmon.belief.nodes import prepare
+from gripmon.belief.rows import fade
 from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
@@ -102,6 +104,17 @@ def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, 
     keep = [i for i in range(SIZE) if i not in range(6, 12)]  # p: not in the sum, which has no creep
     assert np.abs((mean - truth.mean) / sigma)[keep].max() < 1e-9
     assert np.abs((covariance - truth.covariance) / np.outer(sigma, sigma))[np.ix_(keep, keep)].max() < 1e-9
+
+
+def test_however_arrays_lie_in_memory_machine_code_is_made_once() -> None:
+    """For other layouts all of it would be compiled again."""
+    rng = np.random.default_rng(6)
+    frame, doubts = frames_of(rng, 4, 1)[0].seen, of_edges(4, 1)
+    turned = Seen._make(np.asfortranarray(of.repeat(2, axis=0))[::2] for of in frame)
+    assert not turned.lines.flags.c_contiguous
+    one, other = (Belief(doubts, ALONG, STEADY).update(seen, DT_S) for seen in (frame, turned))
+    assert np.array_equal(one.motion, other.motion) and one.bound == other.bound
+    assert len(prepare.signatures) == len(fade.signatures) == 1
 
 
 def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_place() -> None:

@@ -197,6 +197,7 @@ class Belief:
         first = self._first
         if not dt_s > 0.0:
             raise ValueError(f"dt_s = {dt_s}: frames follow each other in time")
+        seen = Seen._make(map(np.ascontiguousarray, seen))  # machine code is made for each layout
         if not first:
             self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY), opening_m)
         for h in range(self._hypotheses):
