@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import cv2
@@ -104,7 +105,8 @@ class FingerMeter(Settler):
         poses = [perturbation_between(prediction.cam_T_grip, pose) for pose in elsewhere]
         starts = [joint, *(np.concatenate([xi, np.zeros(len(joint) - 6)]) for xi in poses)]
         starts = [s for s in starts if prediction.moved_px(s) < 2.0 * self._reach_px] or [np.zeros(len(joint))]
-        best = self._best(edgels, finger, [*starts, *_shifted(edgels, finger_of(self, edgels) == finger, starts[-1])])
+        shifted = _shifted(edgels, finger_of(self, edgels) == finger, starts[-1])
+        best = self._best(edgels, finger, chain(starts, shifted))
         if best is None or best.share >= FINGER_SEEN_SHARE:
             return best
         opening_m = prediction.jaw_opening_m
@@ -126,7 +128,7 @@ class FingerMeter(Settler):
             edgels = self._look(image, self._predict(self._lay_out(expected), expected))
             own = finger_of(self, edgels) == finger
             start = np.zeros(len(self._prior))
-            rough = self._best(edgels, finger, [start, *_shifted(edgels, own, start)])
+            rough = self._best(edgels, finger, chain([start], _shifted(edgels, own, start)))
         if rough is None:
             return None
         there = replace(expected, cam_T_grip=perturb(expected.cam_T_grip, rough.fit.xi[:6]))
@@ -143,7 +145,9 @@ class FingerMeter(Settler):
             self._zoom = before
 
     def _best(self, edgels: Edgels, finger: int, starts: Iterable[Array]) -> _Place | None:
-        """The best fit of one finger from starts (m,), the first unless another is clearly better."""
+        """The best fit of one finger from starts (m,), the first unless another is clearly better: no more are tried
+        where none can be.
+        """
         own = finger_of(self, edgels)
         sampled = int(np.count_nonzero(own[edgels.prediction.ok] == finger))
         if not sampled:
@@ -157,6 +161,8 @@ class FingerMeter(Settler):
             share = np.count_nonzero(fit.supported) / sampled
             if best is None or share > ELSEWHERE_SHARE_RATIO * best.share:
                 best = _Place(edgels, fit, share)
+                if ELSEWHERE_SHARE_RATIO * share >= 1.0:
+                    break
         return best
 
 
@@ -207,9 +213,9 @@ def _brightest(image: Image) -> float:
 
 def _steepest(image: Image) -> float:
     """Difference between neighbouring pixels that one pair in a thousand exceeds, from some forty rows and columns."""
-    rows = image[:: max(1, image.shape[0] // 36)].astype(np.float32)
-    columns = image[:, :: max(1, image.shape[1] // 48)].astype(np.float32)
-    return max(float(np.percentile(np.abs(np.diff(lines, axis=a)), 99.9)) for a, lines in ((1, rows), (0, columns)))
+    rows, columns = image[:: max(1, image.shape[0] // 36)], image[:, :: max(1, image.shape[1] // 48)]
+    pairs = (rows[:, 1:], rows[:, :-1]), (columns[1:], columns[:-1])
+    return max(float(np.percentile(cv2.absdiff(*map(np.ascontiguousarray, pair)), 99.9)) for pair in pairs)
 
 
 def _cells(image: Image) -> Array:
@@ -223,12 +229,12 @@ def finger_of(meter: FingerMeter, edgels: Edgels) -> NDArray[np.intp]:
     return np.asarray(meter._gripper.edge_finger[edgels.prediction.layout.edge])
 
 
-def _shifted(edgels: Edgels, own: NDArray[np.bool_], base: Array) -> list[Array]:
+def _shifted(edgels: Edgels, own: NDArray[np.bool_], base: Array) -> Iterator[Array]:
     """The most promising starts that shift a finger, of which the search lines ``own`` (n,) are, in the image."""
     prediction, candidates = edgels.prediction, edgels.candidates
     active = np.flatnonzero((edgels.weight > 0.0) & own[candidates.sample])
     if not prediction.pixels_per_m > 0.0 or not len(active):
-        return []
+        return
     reach_px = float(np.abs(candidates.offset_px[active]).max())
     step_px = _STEP_PX * candidates.zoom
     count = round(reach_px / step_px)
@@ -239,7 +245,7 @@ def _shifted(edgels: Edgels, own: NDArray[np.bool_], base: Array) -> list[Array]
     predicted = starts @ prediction.jacobian_by_unknown[:, candidates.sample[active]]
     distance = (candidates.offset_px[active] - predicted) / (1.25 * step_px)
     score = np.maximum(1.0 - distance**2, 0.0).sum(axis=1)
-    return [starts[i] for i in np.argsort(-score, kind="stable")[:_REFINED]]
+    yield from starts[np.argsort(-score, kind="stable")[:_REFINED]]
 
 
 class _Stretches(NamedTuple):
