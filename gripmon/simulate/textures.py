@@ -304,9 +304,12 @@ _LONG_FACE = 0.5  # a face is long if its normal's component along the finger is
 
 def grid_m(rows: int, columns: int, px_per_m: float, body_T_plane: Array) -> Array:
     """Points (rows, columns, 3) of a texture's texels in the body's frame."""
-    x, y = np.meshgrid(np.arange(columns) / px_per_m, np.arange(rows) / px_per_m)
-    plane = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    return plane @ body_T_plane[:3, :3].T + body_T_plane[:3, 3]
+    x, y = np.arange(columns) / px_per_m, np.arange(rows)[:, None] / px_per_m
+    out = np.empty((3, rows, columns))
+    for axis, (by_x, by_y, _, start) in zip(out, body_T_plane[:3].tolist(), strict=True):
+        np.add(by_x * x, by_y * y, out=axis)
+        axis += start
+    return np.moveaxis(out, 0, -1)
 
 
 def marks(wanted: list[FingerMark], solid: Solid, face: int, grid: Array, px_per_m: float) -> Factor:
@@ -336,24 +339,28 @@ def marks(wanted: list[FingerMark], solid: Solid, face: int, grid: Array, px_per
 
 def lines(rng: Rng, look: ObjectLook, solid: Solid, grid: Array, px_per_m: float) -> Factor:
     """Factor of a line pattern on one face of an object; equal on all faces for the same random state."""
-    out = np.ones(grid.shape[:2])
     if look.pattern == "plain":
-        return out.astype(np.float32)
+        return even(*grid.shape[:2])
     # On a face without extent along the fingers, a line parallel to the tips has a position along y.
     beyond = 2 if np.ptp(grid[..., 2]) > _FLAT_M else 1
     if look.pattern == "fold":
         inside = solid.vertices_m[:, beyond].max() - look.pitch_m - grid[..., beyond]
-        return _blurred(out - look.contrast * _filled(inside, px_per_m))
+        return _blurred(1.0 - look.contrast * _filled(inside, px_per_m))
     # Lines along the fingers have positions across them: on each face the axis that varies.
     axis = beyond if look.pattern == "lines_along_tips" else int(np.ptp(grid[..., :2], axis=(0, 1)).argmax())
     place_m = grid[..., axis]
     start_m, end_m = float(place_m.min()), float(place_m.max())
+    if (place_m == place_m[:1]).all():  # of a box all rows are alike, or all columns
+        place_m = place_m[:1]
+    elif (place_m == place_m[:, :1]).all():
+        place_m = place_m[:, :1]
+    out = np.ones(place_m.shape)
     while start_m < end_m:
         width_m = look.pitch_m * float(rng.uniform(0.2, 0.8))
         inside = np.minimum(place_m - start_m, start_m + width_m - place_m)
         out -= look.contrast * float(rng.uniform(0.4, 1.0)) * _filled(inside, px_per_m)
         start_m += width_m + look.pitch_m * float(rng.uniform(0.2, 0.8))
-    return _blurred(out)
+    return _blurred(np.broadcast_to(out, grid.shape[:2]))
 
 
 def _filled(inside_m: Array, px_per_m: float) -> NDArray[np.float64]:
