@@ -12,7 +12,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from support.changing_backgrounds import CAMERA, beside_truth_px, coverage, crossing_px, images_of, moving_robot
+from support.changing_backgrounds import (
+    CAMERA,
+    beside_truth_px,
+    coverage,
+    crossing_px,
+    images_of,
+    made_of,
+    moving_robot,
+)
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 import gripmon
@@ -83,7 +91,7 @@ def test_the_outline_lies_within_a_fifth_of_a_pixel_of_the_true_silhouette(name:
     simulator, found = moving_robot(**SCENES[name]), box[1]
     if name != "plain look":  # that is the box
         images = images_of(simulator, 30 if name in MORE else 15)
-        found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+        found = made_of(images, PAPER_LENS, distance_m=DISTANCE)
     away = beside_truth_px(chains_of(found), coverage(simulator))
     assert len(away) > 200
     assert np.quantile(away, 0.95) <= 0.2
@@ -109,7 +117,7 @@ def test_of_few_images_what_is_written_is_right_and_the_rest_is_left_out(name: s
     covered, written, reasons = coverage(simulator), 0, []
     for first in (0, 2):
         try:
-            found = gripper_from_images(images[first::4][:count], PAPER_LENS, distance_m=DISTANCE)
+            found = made_of(images[first::4][:count], PAPER_LENS, distance_m=DISTANCE)
         except NoResultError as refused:
             reasons.append(str(refused))
             continue
@@ -135,7 +143,7 @@ def test_a_border_before_one_background_is_named_and_marked() -> None:
     ]
     wanted = "along the right finger's outer border .* the background is the same there in all images; add"
     with pytest.raises(UnclearPartsError, match=wanted) as caught:
-        gripper_from_images([image.astype(np.uint8) for image in shown], PAPER_LENS, distance_m=DISTANCE)
+        made_of([image.astype(np.uint8) for image in shown], PAPER_LENS, distance_m=DISTANCE)
     unseen = np.vstack(caught.value.unseen_px)
     assert len(unseen) > 100 and np.mean(unseen[:, 0] > 500) > 0.8
     drawn = caught.value.picture(images[0])
@@ -167,9 +175,9 @@ def test_blocks_of_strong_compression_are_no_edges_and_are_named(quality: int, w
     words = "the images are compressed strongly .* a higher quality"
     if not written:
         with pytest.raises(NoResultError, match=words):
-            gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+            made_of(images, PAPER_LENS, distance_m=DISTANCE)
         return
-    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    found = made_of(images, PAPER_LENS, distance_m=DISTANCE)
     assert any(re.match(words, note) for note in found.notes)
     away = beside_truth_px(chains_of(found), coverage(simulator))
     assert np.mean(away > 1.0) < 0.01 and np.quantile(away, 0.95) < 0.4
@@ -263,7 +271,7 @@ def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
     """Told a distance that is a standard deviation too long: nothing in an image can show that."""
     images, exact = box
     sigma_m = 0.002
-    found = gripper_from_images(images[::2], PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
+    found = made_of(images[::2], PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
     assert found.gripper.model.scale_sigma == pytest.approx(sigma_m / (DEPTH_M + sigma_m), rel=0.05)
     scenario = Scenario(name="x", duration_s=2.0, fps=15.0, background=Background(kind="printed"))
     simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
@@ -283,7 +291,7 @@ def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
 
 def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tuple) -> None:
     images, _ = box
-    found = gripper_from_images(images, PAPER_LENS)
+    found = made_of(images, PAPER_LENS)
     assert found.gripper.model.scale_sigma == SIZE_UNKNOWN and found.cam_T_grip[2, 3] == NOMINAL_DISTANCE_M
     assert found.covariance[2, 2] >= NOMINAL_DISTANCE_M**2
     assert any("size is unknown" in note and "valid_by: reference" in note for note in found.notes)
@@ -341,7 +349,7 @@ def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(ra
     from benchmarks.rounded import rounded_model, rounded_solids
 
     solids = rounded_solids(0.012, radius_m)
-    found = gripper_from_images(images_of(moving_robot(311, gripper=solids)), PAPER_LENS, distance_m=DISTANCE)
+    found = made_of(images_of(moving_robot(311, gripper=solids)), PAPER_LENS, distance_m=DISTANCE)
     gripper = found.gripper
     assert len(gripper.edge_ids) == 6 and np.count_nonzero(gripper.edge_curved) == 2 and not len(gripper.corner_ids)
     assert any("plane of their sides" in note for note in found.notes)
@@ -367,7 +375,7 @@ def test_openings_in_metres_tell_distance_and_motion() -> None:
     for seed, opening_m, count in ((401, 0.034, 15), (402, 0.024, 12)):
         images += images_of(moving_robot(seed, "printed", opening_m=opening_m), count)
         openings += [opening_m] * count
-    found = gripper_from_images(images, PAPER_LENS, openings_m=openings)
+    found = made_of(images, PAPER_LENS, openings_m=openings)
     sigma_m = float(np.sqrt(found.covariance[2, 2]))
     assert abs(found.cam_T_grip[2, 3] - DEPTH_M) < max(4.0 * sigma_m, 0.01 * DEPTH_M)
     assert found.gripper.jaw_nominal_m == 0.034
@@ -383,10 +391,10 @@ def test_openings_in_metres_tell_distance_and_motion() -> None:
 
 def test_a_fingers_width_or_a_calibration_give_the_scale(box: tuple) -> None:
     images = box[0][::2]
-    by_width = gripper_from_images(images, PAPER_LENS, finger_width_m=(0.010, 1e-4))
+    by_width = made_of(images, PAPER_LENS, finger_width_m=(0.010, 1e-4))
     assert abs(by_width.cam_T_grip[2, 3] - DEPTH_M) < 0.02 * DEPTH_M
     pose, covariance = nominal_cam_T_grip(), np.diag([1e-8] * 3 + [1e-6] * 3)
-    on_plate = gripper_from_images(images, PAPER_LENS, reference=(pose, covariance))
+    on_plate = made_of(images, PAPER_LENS, reference=(pose, covariance))
     assert np.array_equal(on_plate.cam_T_grip, pose)
     assert np.array_equal(on_plate.covariance, covariance)
     innermost = on_plate.gripper.points_grip_m()[on_plate.gripper.corner_points]
@@ -399,7 +407,7 @@ def test_images_that_contradict_are_left_out_and_named(box: tuple) -> None:
     spoilt[4] = np.roll(images[4], 3, axis=1)
     spoilt[9] = cv2.GaussianBlur(images[9], (0, 0), 2.5)
     spoilt[17] = np.roll(images[17], 40, axis=0)
-    again = gripper_from_images(spoilt, PAPER_LENS, distance_m=DISTANCE)
+    again = made_of(spoilt, PAPER_LENS, distance_m=DISTANCE)
     assert set(again.left_out) == {"image 10", "image 18"}
     assert "moved" in again.left_out["image 18"]
     assert "blurred" in again.left_out["image 10"]
@@ -425,10 +433,10 @@ def test_what_shows_no_gripper_is_refused_in_one_line(box: tuple) -> None:
         (images[:12] + other, "gripper|finger"),
     ):
         with pytest.raises(NoResultError, match=word) as caught:
-            gripper_from_images(wrong, PAPER_LENS, distance_m=DISTANCE)
+            made_of(wrong, PAPER_LENS, distance_m=DISTANCE)
         assert "\n" not in str(caught.value)
     with pytest.raises(NoResultError, match=r"10 of 25 images show one opening, from image 16 to image 25; .* blurred"):
-        gripper_from_images([*images[15:30], *blurred], PAPER_LENS, openings_m=[0.03] * 15 + [0.02] * 10)
+        made_of([*images[15:30], *blurred], PAPER_LENS, openings_m=[0.03] * 15 + [0.02] * 10)
 
 
 def test_wrong_input_says_what_would_be_right(box: tuple) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support.changing_backgrounds import CAMERA, beside_truth_px, images_of, moving_robot
+from support.changing_backgrounds import CAMERA, beside_truth_px, images_of, made_of, moving_robot
 from support.grippers import gripper_from_dict
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
@@ -133,8 +133,8 @@ def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:
     pictures = MeshCamera(CAMERA, tapered()[:1], 5)
     images = [pictures.picture(POSE) for _ in range(12)]
     with pytest.raises(UnclearPartsError, match="--fingers 1"):
-        gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
-    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE, fingers=1)
+        made_of(images, PAPER_LENS, distance_m=DISTANCE)
+    found = made_of(images, PAPER_LENS, distance_m=DISTANCE, fingers=1)
     assert found.gripper.finger_ids == ("finger",) and not found.gripper.has_jaw
     away = beside_truth_px(chains_of(found), pictures.coverage(POSE))
     assert len(away) > 150 and np.quantile(away, 0.95) <= 0.2
@@ -164,9 +164,9 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart() -> None:
     images: list[Image] = []
     for seed, opening_m, count in ((501, 0.034, 14), (502, 0.024, 10)):
         images += images_of(moving_robot(seed, "printed", gripper=gripper, opening_m=opening_m), count)
-    alone = gripper_from_images(images[:14], PAPER_LENS, distance_m=DISTANCE)
+    alone = made_of(images[:14], PAPER_LENS, distance_m=DISTANCE)
     assert alone.gripper.finger_ids == ("left", "right")
-    found = gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+    found = made_of(images, PAPER_LENS, distance_m=DISTANCE)
     assert found.gripper.finger_ids == ("left", "right")
     assert any("joins the fingers" in note for note in found.notes)
     assert abs(found.gripper.jaw_nominal_m - 0.034) < 2e-4
@@ -195,5 +195,5 @@ def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:
     moved = nominal_cam_T_grip(tcp_m=(0.006, 0.0013, 0.115))
     images = images_of(moving_robot(601, "printed"), 12) + images_of(moving_robot(602, "printed", cam_T_grip=moved), 11)
     with pytest.raises(NoResultError, match=r"sets of 12 and 11.*the camera moved") as caught:
-        gripper_from_images(images, PAPER_LENS, distance_m=DISTANCE)
+        made_of(images, PAPER_LENS, distance_m=DISTANCE)
     assert "\n" not in str(caught.value)

@@ -262,9 +262,10 @@ def _fit(read: _Read, gamma: float) -> _Fit:
     slope = gamma * np.maximum(v, _NOISE) ** (gamma - 1.0) * sigma
     weight = inside.astype(float)
     off = np.zeros(v.shape)
+    wide = (b - f) / slope
+    along, square = wide * (light - f) / slope, wide**2
     for _ in range(_ROUNDS):
-        wide = (b - f) / slope
-        share = (weight * wide * (light - f) / slope).sum(axis=0) / np.maximum((weight * wide**2).sum(axis=0), 1e-12)
+        share = (weight * along).sum(axis=0) / np.maximum((weight * square).sum(axis=0), 1e-12)
         off = (v - np.maximum(f + share * (b - f), 1e-9) ** (1.0 / gamma)) / sigma
         weight = inside / (1.0 + off**2)
     return _Fit(off, sigma, np.asarray(inside))

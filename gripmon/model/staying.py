@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gripmon.model.ranks import of_ranks
 from gripmon.model.records import Array
 
 Plane = NDArray[np.float32]
@@ -158,8 +159,7 @@ def _quantiles(images: Sequence[Plane]) -> tuple[Plane, Plane]:
         first, last = max(top - margin, 0), min(top + rows + margin, height)
         slopes = np.stack([np.hypot(*gradient(image[first:last])) for image in images])
         slopes = slopes[:, top - first : min(top + rows, height) - first]
-        slopes.partition((low, high), axis=0)
-        usual[top : top + rows], upper[top : top + rows] = slopes[low], slopes[high]
+        usual[top : top + rows], upper[top : top + rows] = of_ranks(slopes, (low, high))
     return usual, upper
 
 

@@ -189,21 +189,13 @@ def _moved_back(matte: Matte, moved: Array, usable_px: Array) -> Matte:
             flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-    return replace(
-        matte,
-        images=images,
-        mean=np.asarray(np.median(images, axis=0), np.float32),
-        moved_px=matte.moved_px + moved[:, :2],
-    )
+    return replace(matte, images=images, moved_px=matte.moved_px + moved[:, :2])
 
 
 def _without(matte: Matte, bad: Mapping[int, str]) -> Matte:
     good = [k for k in range(len(matte.kept)) if k not in bad]
-    images = matte.images[good]
-    return replace(
-        matte, images=images, mean=np.asarray(np.median(images, axis=0), np.float32), moved_px=matte.moved_px[good],
-        kept=tuple(matte.kept[k] for k in good),
-    )  # fmt: skip
+    kept = tuple(matte.kept[k] for k in good)
+    return replace(matte, images=matte.images[good], moved_px=matte.moved_px[good], kept=kept)
 
 
 def _length_px(chain: Chain) -> float:

@@ -7,6 +7,7 @@ pixel or so: each is moved back, first by the direction of edges, and then adjus
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from scipy.spatial.distance import squareform
 
 from gripmon.model.errors import NoResultError
 from gripmon.model.pixels import GREY_BGR
+from gripmon.model.ranks import median
 from gripmon.model.records import Array, Image
 from gripmon.model.staying import LEAST_SLOPE, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
 from gripmon.track.edges.profiles import full_scale, quantum
@@ -48,14 +50,13 @@ _SMALL = 4
 
 @dataclass(frozen=True)
 class Matte:
-    """``mean`` (h, w), the median grey levels; ``still`` (h, w), which pixels belong to what stays; ``edges``, how
-    surely; ``noise``, the usual scatter of a pixel of these over the images, in grey levels of 0 to 255.
+    """``still`` (h, w), which pixels belong to what stays; ``edges``, how surely; ``noise``, the usual scatter of a
+    pixel of these over the images, in grey levels of 0 to 255.
 
     ``images`` (n, h, w) float32 at common places and grey levels, ``moved_px`` (n, 2), by how much each was displaced;
     ``kept`` (n,) their indices among those given, ``left_out`` why others weren't used.
     """
 
-    mean: Plane
     still: Bits
     edges: Edges
     noise: float
@@ -63,6 +64,11 @@ class Matte:
     moved_px: Array
     kept: tuple[int, ...]
     left_out: dict[int, str]
+
+    @functools.cached_property
+    def mean(self) -> Plane:
+        """(h, w), the median grey levels."""
+        return median(self.images)
 
 
 def grey_levels(image: Image) -> Plane:
@@ -122,13 +128,13 @@ def find_matte(images: Sequence[Plane], least_noise: float, step: Callable[[], N
     stack = np.stack([shifted(given[k], -moved[k]) for k in kept])
     inside = _inside(still)
     _level(stack, inside)
-    mean = np.asarray(np.median(stack, axis=0), np.float32)
-    noise = _noise((image - mean for image in stack), inside, least_noise)
+    usual = median(stack)
+    noise = _noise((image - usual for image in stack), inside, least_noise)
     step()
     sets = image_sets(list(stack))
     if len(sets) > 1:
         raise sets_refused([len(own) for own in sets])
-    return Matte(mean, still, edges, noise, stack, moved[kept], tuple(kept), left_out)
+    return Matte(still, edges, noise, stack, moved[kept], tuple(kept), left_out)
 
 
 def shifted(image: Plane, by_px: Array) -> Plane:

@@ -187,13 +187,12 @@ def measure_transitions(
     offset, fits = _edge(transition[:, near], s[near], blur_px, search)
     usable &= fits
     fold = folds_of(len(images))
-    folds = np.empty((int(fold.max()) + 1, len(offset)))
-    for f in range(len(folds)):
+    without = []
+    for f in range(int(fold.max()) + 1):
         part = fold == f
-        without = (total_upper - upper[part].sum(axis=0)) / np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)[
-            :, None
-        ]
-        folds[f] = _edge(without[:, near], s[near], blur_px, search)[0]
+        rest = np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)
+        without.append(((total_upper - upper[part].sum(axis=0)) / rest[:, None])[:, near])
+    folds = _edge(np.concatenate(without), s[near], blur_px, search)[0].reshape(len(without), -1)
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
@@ -270,19 +269,19 @@ def _read(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[
 
 @lru_cache(maxsize=128)
 def _bases(samples: tuple[float, ...], blur_px: float, search_px: float) -> tuple[Array, Array]:
-    """Positions to try (g,), and an orthonormal basis of the transition at each, side by side (samples, 4 g)."""
+    """Positions to try (g,), and the four vectors of an orthonormal basis of the transition at each (samples, 4 g)."""
     s = np.array(samples)
     grid = np.arange(-search_px, search_px + 0.5 * _GRID_PX, _GRID_PX)
     bases = []
     for e in grid:
         rise = ndtr((s - e) / blur_px)
         bases.append(np.linalg.qr(np.column_stack([rise, rise * (s - e), 1.0 - rise, (1.0 - rise) * (s - e)]))[0])
-    return grid, np.hstack(bases)
+    return grid, np.stack(bases, axis=2).reshape(len(s), -1)
 
 
 def _misfit(transition: Array, s: Array, blur_px: float, search_px: float) -> tuple[Array, Array]:
     grid, bases = _bases(tuple(s.tolist()), blur_px, search_px)
-    within = np.square(transition @ bases).reshape(-1, len(grid), 4).sum(axis=2)
+    within = np.square(transition @ bases).reshape(-1, 4, len(grid)).sum(axis=1)
     return grid, np.square(transition).sum(axis=1) - within.T
 
 

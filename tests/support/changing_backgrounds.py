@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,17 @@ from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Light, Sensor
+from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.straight_pieces import Chain
 from support.kept import kept
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 CAMERA = make_camera(PAPER_LENS)
+
+made_of = partial(gripper_from_images, response="linear")
+"""Linear, as simulated images are: a quarter of the time goes to finding that out, which the first results of two test
+files and those of commands are asked for, and ``tests/test_response.py``.
+"""
 
 
 def moving_robot(
