@@ -134,6 +134,9 @@ class TableView:
         still = msgspec.structs.replace(settings, motion="still", speed_m_per_s=0.0, defocus_px=0.0)
         table = _drawn(still, seed, self._px_per_m)
         self._tile, self._blocks = table.tile, table.blocks
+        self._centres_m = np.array([block.centre_m for block in table.blocks]).reshape(-1, 2)
+        self._outlines_m = np.array([_outline(block) for block in table.blocks]).reshape(-1, 4, 2)
+        self._tops_m = np.array([-block.height_m for block in table.blocks])
         self._path = _Path(copy.deepcopy(table.rng), settings)
 
     def cam_T_table(self, cam_T_grip: Array, t_s: float) -> Array:
@@ -182,32 +185,29 @@ class TableView:
         eye = invert(cam_T_table)[:3, 3]
         look = self._rays.view_centre @ cam_T_table[:3, :3]
         middle = (eye - eye[2] / max(look[2], 0.1) * look)[:2]
-        seen = []
-        for block in self._blocks:
-            centre = block.centre_m + self._period_m * np.round((middle - block.centre_m) / self._period_m)
-            seen.append((float(np.hypot(*(centre - eye[:2]))), centre, block))
-        for _, centre, block in sorted(seen, key=lambda item: -item[0]):
-            self._draw_block(image, cam_T_table, eye, block, centre)
+        periods_m = self._period_m * np.round((middle - self._centres_m) / self._period_m)
+        bases_m = self._outlines_m + periods_m[:, None]
+        corners_m = np.zeros((len(self._blocks), 2, 4, 3))  # of the base, and of the top
+        corners_m[..., :2] = bases_m[:, None]
+        corners_m[:, 1, :, 2] = self._tops_m[:, None]
+        corners_cam_m = corners_m.reshape(-1, 3) @ cam_T_table[:3, :3].T + cam_T_table[:3, 3]
+        uv = self._camera.project(corners_cam_m).reshape(-1, 8, 2)
+        size = np.array([self._camera.width_px, self._camera.height_px])
+        in_view = np.isfinite(uv).all(axis=(1, 2)) & ((uv.max(axis=1) >= 0) & (uv.min(axis=1) <= size)).all(axis=1)
+        away_m = np.linalg.norm(self._centres_m + periods_m - eye[:2], axis=1)
+        for k in filter(in_view.__getitem__, np.argsort(-away_m, kind="stable").tolist()):
+            _draw_block(image, eye, self._blocks[k], bases_m[k], uv[k])
 
-    def _draw_block(
-        self, image: NDArray[np.uint8], cam_T_table: Array, eye: Array, block: _Block, centre: Array
-    ) -> None:
-        base = _outline(block) - block.centre_m + centre
-        low = np.column_stack([base, np.zeros(4)])
-        high = np.column_stack([base, np.full(4, -block.height_m)])
-        vertices = np.concatenate([low, high]) @ cam_T_table[:3, :3].T + cam_T_table[:3, 3]
-        uv = self._camera.project(vertices)
-        if not np.isfinite(uv).all():
-            return
-        if (uv.max(axis=0) < 0).any() or (uv.min(axis=0) > (self._camera.width_px, self._camera.height_px)).any():
-            return
-        for k in range(4):
-            j = (k + 1) % 4
-            along = base[j] - base[k]
-            if along[1] * (eye[0] - base[k, 0]) - along[0] * (eye[1] - base[k, 1]) > 0.0:
-                _paint_quad(image, uv[[k, j, j + 4, k + 4]], block.faces[1 + k])
-        if eye[2] < -block.height_m:
-            _paint_quad(image, uv[4:], block.faces[0])
+
+def _draw_block(image: NDArray[np.uint8], eye: Array, block: _Block, base: Array, uv: Array) -> None:
+    """A box with the ``base`` (4, 2) on the table, m, and corners ``uv`` (8, 2), px, the base's first."""
+    for k in range(4):
+        j = (k + 1) % 4
+        along = base[j] - base[k]
+        if along[1] * (eye[0] - base[k, 0]) - along[0] * (eye[1] - base[k, 1]) > 0.0:
+            _paint_quad(image, uv[[k, j, j + 4, k + 4]], block.faces[1 + k])
+    if eye[2] < -block.height_m:
+        _paint_quad(image, uv[4:], block.faces[0])
 
 
 class _Path:
