@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.meters import box_gripper, difference, moved
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.watched import pose_of, reference_of
+from support.watched import pose_of, reference_of, rendered
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
@@ -96,15 +96,15 @@ def seen(
     """``off`` (6,): by how much the reference is wrong; ``scale``: of the gripper file, known to 1 % if it isn't 1."""
     true, pose, camera = box_gripper(sharp=False), nominal_cam_T_grip(), make_camera(PAPER_LENS)
     file = true if scale == 1.0 else scaled(true, scale, 0.01)
-    simulator = Simulator(camera, true, pose, scenario, 1)
     reference_T = moved(pose, np.array(off))
     monitor = Monitor(camera, file, MonitorSettings(policy=policy), reference_at(reference_T))
-    first_T, records, rows = simulator.truth(0).cam_T_grip, [], []
-    for i in range(simulator.frame_count):
-        record = monitor.process(simulator.frame(i))
+    frames, truths = rendered(scenario)
+    first_T, records, rows = truths[0].cam_T_grip, [], []
+    for frame, truth in zip(frames, truths, strict=True):
+        record = monitor.process(frame)
         monitor.run_pending()
         assert record.cam_T_grip is not None and record.measured_T is not None and record.absolute is not None
-        truth_T, since = simulator.truth(i).cam_T_grip, record.since_reference
+        truth_T, since = truth.cam_T_grip, record.since_reference
         error = difference(pose_of(record.cam_T_grip), truth_T @ np.linalg.inv(first_T) @ reference_T)
         absolute = difference(pose_of(record.measured_T), truth_T)
         assert since is not None
