@@ -1,7 +1,8 @@
 """The files whose tests take longest, to be begun first: a long one that is begun last keeps one worker busy alone.
 
 By processor time with that of the processes that they start, from a hundred and fifty seconds down to ten; then those
-that mostly wait.  How exact the order is matters little.  ``tools/test --durations 100`` shows what has become long.
+that mostly wait.  How exact the order is matters little, but that ``test_belief`` compiles the belief, half a minute,
+before others need it.  ``tools/test --durations 100`` shows what has become long.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 LONGEST = (
     "test_gripper_from_images",
     "test_first_run",
+    "test_belief",
     "test_dataset",
     "test_trust",
     "test_setup",
@@ -24,6 +26,8 @@ LONGEST = (
     "test_curved_edges",
     "test_spotwatch",
     "test_look",
+    "test_response",
+    "test_shadow",
     "test_restart",
     "test_bench_real_images",
     "test_replay_recording",
