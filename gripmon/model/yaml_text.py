@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
-import pickle
 import re
 from typing import Any
 
@@ -67,15 +67,15 @@ Loader.add_constructor(_TAG + "map", _mapping)
 
 
 @functools.lru_cache(maxsize=8)
-def _pickled(text: str) -> bytes:
-    """A start reads its files more than once, and parsing takes hundreds of times as long as a copy."""
-    return pickle.dumps(yaml.load(text, Loader))
+def _parsed(text: str) -> Any:
+    """A start reads its files more than once, and parsing takes much longer than a copy."""
+    return yaml.load(text, Loader)
 
 
 def parse_yaml(text: str) -> Any:
     """The contents of a document.  Raises :class:`YamlFault`."""
     try:
-        return pickle.loads(_pickled(text))
+        return copy.deepcopy(_parsed(text))
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise YamlFault(line, f"not YAML: {error.problem or error.context or 'malformed'}") from None
