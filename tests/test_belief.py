@@ -469,6 +469,25 @@ def test_who_stops_trusting_the_ends_expects_a_knock_at_once_and_once(hidden: bo
         assert all(0.9e-3 / 3.0 < weight < 2e-3 for _, weight in beyond[1e-3][5:])
 
 
+def test_a_knock_behind_hidden_ends_is_kept_beside_many_sets_of_one_place() -> None:
+    """Edges that are now and then off make many sets of doubts that all say the same place; 24 hypotheses go on."""
+    edges = 12
+    priors = replace(STEADY, reference=(1e-9,) * 6, small_per_s=1e-15)
+    frames = frames_of(np.random.default_rng(8), edges, 16, 0.3, priors=priors)
+    ends = np.arange(edges) >= 9
+    for frame in frames:
+        frame.seen.rows[~ends, ..., 2] = frame.seen.rows[~ends, ..., 14] = 0.0
+    for frame in frames[4:]:
+        frame.seen.found[ends] = 0
+    belief = Belief([*of_edges(edges, 1), *of_ends([ends])], np.array([0.0, 0.0, 1.0]), priors, most=24)
+    for frame in frames:
+        belief.update(frame.seen, DT_S)
+    bank, n = belief._bank, belief._hypotheses
+    away = np.sqrt(bank.covariance[:n, 2, 2]) > 1e-3
+    assert (~away).sum() >= 4
+    assert np.exp(bank.log_weight[:n][away]).sum() > 1e-4
+
+
 def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
     """A filter that keeps two hypotheses, where the mount may have jumped in seven ways while no end is shown."""
     frames = frames_of(np.random.default_rng(6), 8, 2, 0.3, clean=True)

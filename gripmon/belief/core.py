@@ -15,6 +15,7 @@ import numpy as np
 
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
+from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
 from gripmon.belief.rows import add_noise, fade, move
@@ -74,52 +75,6 @@ class Believed(NamedTuple):
     dropped: float
     surprise: float
     known: bool
-
-
-class Jumps(NamedTuple):
-    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), or is so ``at_first`` (j,), with ``factors``
-    (j, 6, 23) of its covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): it is one.
-    """
-
-    share: Array
-    per_s: Array
-    at_first: Array
-    factors: Array
-    ranks: Ints
-    knock: Array
-
-    @classmethod
-    def of(cls, priors: Priors, along: Array) -> Jumps:
-        """``along`` (3,): the fingers' direction in camera axes."""
-        shares, rates, factors, knock = [], [], [], []
-
-        def put(share: float, rate: float, rows: Array, is_knock: bool) -> None:
-            shares.append(share)
-            rates.append(rate)
-            factors.append(rows)
-            knock.append(is_knock)
-
-        put(1.0, priors.small_per_s, _diagonal([priors.small_m] * 3 + [priors.small_rad] * 3), False)
-        for size_m, share in priors.any_way:
-            put(
-                share * (1.0 - priors.along_share),
-                priors.knock_per_s,
-                _diagonal([size_m] * 3 + [priors.knock_rad] * 3),
-                True,
-            )
-        for size_m, share in priors.along:
-            row = np.zeros((1, SIZE))
-            row[0, :3] = size_m * along
-            put(share * priors.along_share, priors.knock_per_s, row, True)
-        row = np.zeros((1, SIZE))
-        row[0, OPENING] = priors.opening_jump_m
-        put(1.0, priors.opening_per_s, row, False)
-        padded = np.zeros((len(factors), 6, SIZE))
-        for j, rows in enumerate(factors):
-            padded[j, : len(rows)] = rows
-        at_first = np.where(np.arange(len(factors)) == len(factors) - 1, priors.opening_first, 0.0)
-        ranks = np.array([len(f) for f in factors])
-        return cls(np.array(shares), np.array(rates), at_first, padded, ranks, np.array(knock))
 
 
 class Belief:
@@ -402,9 +357,3 @@ def _bounded() -> Array:
 
 _BOUNDED = _bounded()
 """(4, 3, 23): which combinations of g :class:`Bound` is about, in its order."""
-
-
-def _diagonal(sigmas: Sequence[float]) -> Array:
-    rows = np.zeros((len(sigmas), SIZE))
-    rows[range(len(sigmas)), range(len(sigmas))] = sigmas
-    return rows

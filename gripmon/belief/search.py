@@ -160,4 +160,18 @@ def search(candidates: Candidates, n: int, nodes: Nodes, bank: Bank, asked: Aske
                 done += 1
         if done == 0:
             break
+    return spread(candidates, n, nodes, bank, asked, reach, least)
+
+
+@compiled
+def spread(candidates: Candidates, n: int, nodes: Nodes, bank: Bank, asked: Asked, reach: float, least: float) -> int:
+    """What the heaviest sets doubt is tried everywhere: else a place loses only since nobody looked there for what
+    begins in several edges at once.
+    """
+    heaviest = np.argsort(-candidates.log_weight[:n])[:AT_ONCE]
+    floor = candidates.log_weight[heaviest[0]] - least
+    for i in range(candidates.node[:n].max() + 1):
+        for c in heaviest if nodes.before[i] > -reach else heaviest[:0]:
+            m = put(candidates, n, nodes, i, candidates.doubts[c], bank, asked)
+            n = m if m > n and candidates.log_weight[n] >= floor else n
     return n

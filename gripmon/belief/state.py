@@ -64,8 +64,8 @@ class Priors:
     in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a
     second's square root while it is loose.
     ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
-    standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability each time that
-    all ends begin to be doubted (policy: what hides them is what knocks).  ``opening_first``, ``opening_per_s``: the
+    standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability since an end
+    was seen last, in each set of doubts (policy: what hides them is what knocks).  ``opening_first``, ``opening_per_s``: the
     reported opening is wrong by ``opening_jump_m``, at first and later.
     """
 
