@@ -60,13 +60,12 @@ class Priors:
     of the search; ``aligned``: share of what lies over fingers' ends that is straight across them, at ``across_m`` from
     these along the fingers (half of the search's reach); ``missed``: probability that an edge, of the gripper or of
     another thing, isn't among the lines that were found there (the same for both: else a picture that stays tells more
-    with every frame).  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount
-    in a second's square root.  ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a
-    second's square root while it is loose.
-    ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians (``any_way``:
-    standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability since an end
-    was seen last, in each set of doubts (policy: what hides them is what knocks).  ``opening_first``, ``opening_per_s``: the
-    reported opening is wrong by ``opening_jump_m``, at first and later.
+    with every frame).  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.
+    ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a second's square root while it is
+    loose.  ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians
+    (``any_way``: standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability
+    since an end was seen last, in each set of doubts (policy: what hides them is what knocks).  ``opening_first``,
+    ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``, at first and later.
     """
 
     reference: tuple[float, ...] = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2)

@@ -89,6 +89,7 @@ class Shadow:
         self._last_s: float | None = None
         self._jaw_m: float | None = None
         self._answer = np.full(len(self._ends_of), -1)
+        self._asked_at: Array | None = None
         self.newest: Believed | None = None
 
     @property
@@ -107,7 +108,8 @@ class Shadow:
             return
         ends = self._tracker.ends(frame, looks[0])
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
-        self.newest = self._belief.update(seen, dt_s, self._told(ends), opening_m=self._opening_noise_m(frame))
+        told = self._told(ends, looks[0])
+        self.newest = self._belief.update(seen, dt_s, told, opening_m=self._opening_noise_m(frame))
         self._last_s = now_s
 
     def _opening_noise_m(self, frame: Frame) -> float:
@@ -120,15 +122,17 @@ class Shadow:
         kept = math.exp(-abs(frame.jaw_opening_m - before) / (2.0 * self._jaw_sigma_m))
         return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
 
-    def _told(self, ends: FingerEndsSeen) -> Told:
-        """Of fingers whose ends are out of view, nothing."""
+    def _told(self, ends: FingerEndsSeen, look: Measurement) -> Told:
+        """Of fingers whose ends are out of view, nothing; an answer is news where the question was asked elsewhere."""
         answer = np.where(ends.might > 0, np.minimum(ends.seen, 2), -1)
         asked, together = np.flatnonzero(answer >= 0), np.full(2, np.nan)
         tables = (LONE_RIGHT, LONE_WRONG) if len(asked) == 1 else (RIGHT, WRONG)
         right, wrong = (np.where(answer >= 0, np.log(of[answer]), 0.0) for of in tables)
         if len(asked) == len(answer) == 2:
             together = np.log([of[answer[0], answer[1]] for of in (BOTH_RIGHT, BOTH_WRONG)])
-        repeats, self._answer = (answer == self._answer) & (answer >= 0), answer
+        here = self._asked_at is not None and _near(look, self._asked_at)
+        repeats, self._answer = (answer == self._answer) & (answer >= 0) & here, answer
+        self._asked_at = look.prediction.cam_T_grip
         return Told(right, wrong, repeats, REPEATS, together)
 
     def _looks(self, frame: Frame, measurement: Measurement) -> list[Measurement]:
