@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from msgspec.structs import replace as replace_lens
 from support.changing_backgrounds import (
     CAMERA,
     beside_truth_px,
@@ -21,6 +22,7 @@ from support.changing_backgrounds import (
     made_of,
     moving_robot,
 )
+from support.faced_fingers import SIZE_PX, FacedFingers
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 import gripmon
@@ -47,6 +49,10 @@ from gripmon.teach.silhouette import backgrounds_beside
 
 DEPTH_M = 0.115
 DISTANCE = (DEPTH_M, 5e-5)
+PLAIN_LENS = replace_lens(
+    PAPER_LENS, width_px=SIZE_PX[0], height_px=SIZE_PX[1], fx_px=600.0, fy_px=600.0, cx_px=239.5, cy_px=179.5,
+    kappa_per_px2=0.0,
+)  # fmt: skip
 
 
 def chains_of(found: GripperFromImages) -> list:
@@ -128,6 +134,21 @@ def test_of_few_images_what_is_written_is_right_and_the_rest_is_left_out(name: s
     assert all(re.search("of a finger's outline shows|may be fingers|one finger is seen", why) for why in reasons)
 
 
+def test_creases_before_faces_of_the_walls_grey_are_no_outline() -> None:
+    """Half of the first fingers' outline was written along them; the others have no such face."""
+    with pytest.raises(NoResultError, match="of a finger's outline shows"):
+        gripper_from_images(FacedFingers(1).images(16), PLAIN_LENS, distance_m=DISTANCE)
+    fingers = FacedFingers(5)
+    found = gripper_from_images(fingers.images(16), PLAIN_LENS, distance_m=DISTANCE)
+    away = np.concatenate([
+        crossing_px(uv_px[0] + np.linspace(0.1, 0.9, 30)[:, None] * (uv_px[1] - uv_px[0]), fingers.covered())
+        for chain in chains_of(found)
+        for uv_px in (chain.uv_px[list(piece)] for piece in chain.pieces)
+        if np.linalg.norm(uv_px[1] - uv_px[0]) > 8.0
+    ])  # fmt: skip
+    assert np.mean(away > 1.0) < 0.02
+
+
 def test_a_border_before_one_background_is_named_and_marked() -> None:
     """Right of the right finger there is a grey band in all images, which fades into what changes."""
     simulator = moving_robot(**SCENES["plain look"])
@@ -156,12 +177,12 @@ def test_a_border_before_one_background_is_named_and_marked() -> None:
     [
         (2, False, "usually 2 of 7 images have a background there that differs from it, .* something bright behind it"),
         (6, True, "the background is the same there in all images; add images with brighter and darker ones"),
-        (6, False, "images contradict each other there; add images with something bright and plain behind it"),
+        (6, False, "a face of the background's grey lies beyond; add images with something bright and plain behind it"),
     ],
 )
 def test_what_would_help_depends_on_what_is_missing(clear: int, same: bool, words: str) -> None:
     border = Border("the finger's tip", 90, 0.42, np.zeros((0, 2)), clear, 7, same, brighter=True)
-    assert re.search(f"along the finger's tip 42 % of the outline shows: {words}$", border.words())
+    assert re.search(f"along the finger's tip 42 % of the outline shows: .*{words}$", border.words())
     between = replace(border, name="the left finger's inner border").words()  # what the jaws hold stays as well
     assert between.endswith(", and with nothing between the jaws") == (same and clear == 6)
 

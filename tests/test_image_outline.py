@@ -9,7 +9,7 @@ import pytest
 from gripmon.model.staying import Edges
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
-from gripmon.teach.silhouette import Stations, Transitions, goes_on_beyond
+from gripmon.teach.silhouette import Stations, Transitions, is_outermost
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
@@ -41,21 +41,24 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
 
 
 @pytest.mark.parametrize("texture_dn", [0.0, 30.0])
-def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(texture_dn: float) -> None:
-    """Grey 80 between a finger of 40 and backgrounds of 90 to 200."""
+@pytest.mark.parametrize("face_dn", [80.0, 145.0])
+def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: float, texture_dn: float) -> None:
+    """Between a finger of 40 and backgrounds of 90 to 200: darker than they are, and as they are in the mean."""
 
-    def goes_on(rng: np.random.Generator, face_px: int) -> bool:
+    def found(rng: np.random.Generator, face_px: int, spread_dn: float = 55.0) -> bool:
         x, images = np.arange(60), []
         for _ in range(6):
             blots = 7.0 * cv2.GaussianBlur(rng.normal(size=(60, 60)), (0, 0), 2.0)
-            back = rng.uniform(90.0, 200.0) + texture_dn * blots
-            image = np.where(x < 30, 40.0, np.where(x < 30 + face_px, 80.0, back))
+            back = rng.uniform(145.0 - spread_dn, 145.0 + spread_dn) + texture_dn * blots
+            image = np.where(x < 30, 40.0, np.where(x < 30 + face_px, face_dn, back))
             images.append(cv2.GaussianBlur(image, (0, 0), 0.9) + rng.normal(size=(60, 60)))
         along = np.column_stack([np.full(30, 29.5), np.arange(15.0, 45.0)])
         stations = Stations(along, np.tile([1.0, 0.0], (30, 1)), np.ones(30, bool))
-        return goes_on_beyond(np.array(images, np.float32), stations, 0.9)
+        return is_outermost(np.array(images, np.float32), stations, 0.9)
 
     rng = np.random.default_rng(1)
-    assert np.mean([goes_on(rng, 0) for _ in range(40)]) <= 0.025
+    assert np.mean([found(rng, 0) for _ in range(40)]) > (0.9 if texture_dn == 0.0 else 0.7)
     for face_px in (2, 4):
-        assert np.mean([goes_on(rng, face_px) for _ in range(40)]) > 0.5
+        assert np.mean([found(rng, face_px) for _ in range(40)]) < 0.1
+    if texture_dn == 0.0:  # before one wall nothing shows
+        assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1

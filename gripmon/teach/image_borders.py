@@ -50,7 +50,10 @@ class Border:
             empty = ", and with nothing between the jaws" if self.name.endswith("inner border") else ""
             always = "the background is the same there in all images"
             return f"{shown}: {always}; add images with brighter and darker ones{empty}"
-        return f"{shown}: images contradict each other there; add images with something {kind} and plain behind it"
+        return (
+            f"{shown}: images contradict each other there, or a face of the background's grey lies beyond; add images "
+            f"with something {kind} and plain behind it"
+        )
 
 
 def borders_of(

@@ -19,7 +19,7 @@ from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.straight_pieces import Chain, fit_chains, runs, without_outliers
+from gripmon.teach.straight_pieces import STRAIGHT_PX, Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""
@@ -164,14 +164,26 @@ def _displaced(stations: Stations, found: Transitions) -> Array:
     normal, arm = stations.normal[chosen], stations.uv_px[chosen] - centre
     design = np.column_stack([normal, (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / size])
     out = np.zeros((len(found.worth), 3))
-    for k in range(len(out)):
-        worth, shift = np.sqrt(found.worth[k, chosen]), np.clip(found.shift_px[k, chosen], -4.0, 4.0)
-        weight = worth.copy()
-        for _ in range(6):
-            out[k] = np.linalg.lstsq(design * weight[:, None], shift * weight, rcond=1e-3)[0]
-            off = np.abs(shift - design @ out[k])
-            weight = worth / np.maximum(off / max(1.4826 * float(np.median(off)), 0.05), 1.0)
+    shift, trust = np.clip(found.shift_px[:, chosen], -4.0, 4.0), np.ones(np.count_nonzero(chosen))
+    for _ in range(2):
+        for k in range(len(out)):
+            out[k] = _robust(design, shift[k], np.sqrt(found.worth[k, chosen] * trust))
+        # Beside a face of the gripper each background shows the edge elsewhere, whatever moved.
+        off = shift - (out - np.median(out, axis=0)) @ design.T
+        off = np.square(off - np.median(off, axis=0))
+        scatter = np.average(off, axis=0, weights=found.worth[:, chosen] + 1e-9)
+        trust = 1.0 / np.maximum(scatter, STRAIGHT_PX**2)
     return np.asarray(out - np.median(out, axis=0))
+
+
+def _robust(design: Array, wanted: Array, worth: Array) -> Array:
+    """Least squares with weights (s,), without outliers."""
+    weight = worth.copy()
+    for _ in range(6):
+        out = np.linalg.lstsq(design * weight[:, None], wanted * weight, rcond=1e-3)[0]
+        off = np.abs(wanted - design @ out)
+        weight = worth / np.maximum(off / max(1.4826 * float(np.median(off)), 0.05), 1.0)
+    return np.asarray(out)
 
 
 def _moved_back(matte: Matte, moved: Array, usable_px: Array) -> Matte:

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr, ndtri, stdtrit
+from scipy.special import fdtri, ndtr, ndtri, stdtrit
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -50,6 +50,8 @@ RISEN = 0.75
 """Part of a contrast that shows two thirds of the blur (the normal distribution's quantile) beyond an edge."""
 BY_CHANCE = 0.01
 """How often grey levels of backgrounds beyond an edge may be taken for something that stays there."""
+NOT_SURE = 0.05
+"""How often what follows less than half of a background's changes, by chance, may seem to follow more."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
@@ -197,23 +199,59 @@ def measure_transitions(
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
-def goes_on_beyond(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
-    """Whether something that stays, not the background, shows beyond an edge at these stations in ``images`` (n, h, w):
-    a narrow face of the finger, so that its outline is more than :data:`WITHIN_PX` away.
+def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
+    """Whether the background begins at an edge at these stations in ``images`` (n, h, w), and not :data:`WITHIN_PX` or
+    more beyond it: something else of the gripper, as a narrow face, may lie between, of whatever grey level.
 
-    An edge so far out would leave more than a quarter of the contrast open where this is asked.  Of backgrounds, grey
-    levels there are as often above as below those 4.5 to 8 px out; what stays differs from them in the mean: Student's
-    t over the images, of means along the edge.  A face of 6 px and more isn't told, nor one of the backgrounds' grey.
+    An edge so far out would leave more than a quarter of the contrast open where this is asked.  Grey levels there are
+    compared over the images with those 4.5 to 8 px out.  What stays differs in the mean (Student's t, of means along
+    the edge), or it doesn't change as the background does.  Where that hardly changes nothing shows it.  A face of 8 px
+    and more isn't told from a background that changes as little.
     """
     s = np.arange(-_NARROW_PX, _WIDE_PX + 0.25, _STEP_PX)
-    levels = _read(images, stations, s).mean(axis=1)
-    far = levels[:, s >= 4.5].mean(axis=1)
+    profiles = _read(images, stations, s)
+    levels = profiles.mean(axis=1)
     begun_px = WITHIN_PX + float(ndtri(RISEN)) * blur_px
-    off = np.array([np.interp(begun_px, s, own) for own in levels]) - far
+    inner, there, outer = (s >= -4.0) & (s <= -2.0), [int(np.searchsorted(s, begun_px))], s >= 4.5
+    far = levels[:, outer].mean(axis=1)
+    near = np.array([np.interp(begun_px, s, own) for own in levels])
+    off = near - far
     scatter = float(np.std(off, ddof=1)) / len(off) ** 0.5
-    contrast = float(np.sqrt(np.square(far - levels[:, (s >= -4.0) & (s <= -2.0)].mean(axis=1)).mean()))
+    contrast = float(np.sqrt(np.square(far - levels[:, inner].mean(axis=1)).mean()))
     least = max(float(stdtrit(len(off) - 1, 1.0 - 0.5 * BY_CHANCE)) * scatter, (1.0 - RISEN) * contrast)
-    return abs(float(off.mean())) > least
+    if abs(float(off.mean())) > least:
+        return False
+    return _follows(near, far) or _changes(*(profiles[:, :, at] for at in (inner, there, outer)))
+
+
+def _follows(near: Array, far: Array) -> bool:
+    """Whether grey levels (n,) show three quarters of the changes of others (n,), by the straight line through them,
+    and by its slope's standard error surely half.
+    """
+    change = far - far.mean()
+    changes = max(float(change @ change), 1e-9)
+    slope = float(change @ near) / changes
+    rest = near - near.mean() - slope * change
+    sigma = (float(rest @ rest) / (len(far) - 2) / changes) ** 0.5
+    return slope > RISEN and slope - float(stdtrit(len(far) - 2, 1.0 - NOT_SURE)) * sigma > 0.5
+
+
+def _changes(inner: NDArray[np.float32], near: NDArray[np.float32], far: NDArray[np.float32]) -> bool:
+    """Whether grey levels (n, stations, samples) near an edge surely change by half as much as those far out, and by
+    more than those on the finger's side, from image to image and along the edge: a texture, which near doesn't follow
+    (Fisher's F).
+    """
+    variance, dof = [], []
+    for levels in (inner, near, far):
+        off = levels - levels.mean(axis=0)
+        each = float(np.square(off).mean())
+        variance.append(each)
+        # As many places along the edge as its mean is better known than one of them.
+        dof.append((len(levels) - 1) * each / max(float(np.square(off.mean(axis=1)).mean()), 1e-9))
+    return all(
+        variance[1] > part * float(fdtri(dof[1], dof[k], 1.0 - NOT_SURE)) * variance[k]
+        for k, part in ((0, 1.0), (2, 0.25))
+    )
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

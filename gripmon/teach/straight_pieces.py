@@ -20,7 +20,7 @@ from gripmon.model.records import Array
 from gripmon.teach.silhouette import (
     Stations,
     from_ideal_px,
-    goes_on_beyond,
+    is_outermost,
     lines_in_image,
     measure_transitions,
     to_ideal_px,
@@ -168,14 +168,16 @@ def _scatter(p: Array) -> float:
 
 @dataclass(frozen=True)
 class _Line:
-    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points."""
+    """Unit normal and distance, ideal pixels, from all images, and (f,) from the folds; ``rms_px`` of its points;
+    ``ends`` (2, 2), between which it is seen, as far as the next piece's blur.
+    """
 
     normal: Array
     distance: float
     fold_normals: Array
     fold_distances: Array
     rms_px: float
-    seen: float
+    ends: Array
 
 
 def fit_chains(
@@ -213,11 +215,11 @@ def fit_chains(
             k += 1
 
     def joined(before: _Found, after: _Found) -> bool:
-        ends = ideal[before[0][1]], ideal[after[0][0]]
-        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX:
+        (_, one), (_, other) = before, after
+        ends = one.ends[1], other.ends[0]
+        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX and _is_smooth(before, after, ideal):
             return True
         # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
-        (_, one), (_, other) = before, after
         distances = np.array([[one.distance], [other.distance]])
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
         return all(
@@ -281,8 +283,8 @@ def _without_rounding(
         near = float(np.linalg.norm(meet - 0.5 * (ideal[first] + ideal[last]))) < LONGEST_CUT_PX
         short = float(np.linalg.norm(ideal[last] - ideal[first])) < LONGEST_CUT_PX
         if near and short and all(
-            _goes_on(camera, images, noise, ideal[end], meet, outward[[end]], blur_px)
-            for end in (before[0][1], after[0][0])
+            _goes_on(camera, images, noise, end, meet, outward[first : last + 1], blur_px)
+            for end in (before[1].ends[1], after[1].ends[0])
         ):  # fmt: skip
             del out[k]
         else:
@@ -310,7 +312,7 @@ def _goes_on(
         return False
     found = measure_transitions(images, stations, noise, wide=False, blur_px=blur_px)
     off = np.abs(found.offset_px[found.usable])
-    return bool(len(off) and float(np.quantile(off, 0.9)) < within_px)
+    return len(off) >= max(1.0, LEAST_USABLE * len(found.usable)) and float(np.quantile(off, 0.9)) < within_px
 
 
 def _is_one(both: _Line, parts: list[tuple[tuple[int, int], _Line]], ideal: Array) -> bool:
@@ -378,9 +380,28 @@ def _measured(
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
     stations = _stations_on(camera, *ends, outward, min(END_MARGIN_PX, 0.2 * length), images[0].shape)
-    if stations is None or goes_on_beyond(images, stations, blur_px):
+    if stations is None or not is_outermost(images, stations, blur_px):
         return None
-    return _Line(line[0], line[1], normals, distances, float(np.sqrt(np.square(residual).mean())), float(inlier.mean()))
+    rms_px = float(np.sqrt(np.square(residual).mean()))
+    return _Line(line[0], line[1], normals, distances, rms_px, _shown(at, inlier, ends))
+
+
+def _shown(at: Array, inlier: NDArray[np.bool_], ends: tuple[Array, Array]) -> Array:
+    """The part (2, 2) of a piece's line between its ``ends`` that its stations ``at`` (s, 2), a pixel apart, follow:
+    from where the shortest piece of them would be measured.
+    """
+    size = min(int(SHORTEST_PIECE_PX), len(inlier))
+    enough = np.flatnonzero(np.convolve(inlier, np.ones(size), "valid") >= LEAST_USABLE * size)
+    if not len(enough):
+        return np.array(ends)
+    follows = np.flatnonzero(inlier)
+    follows = follows[(follows >= enough[0]) & (follows < enough[-1] + size)]
+    way = (ends[1] - ends[0]) / float(np.linalg.norm(ends[1] - ends[0]))
+    out = np.array(ends)
+    for side, k in enumerate((follows[0], follows[-1])):
+        if k not in (0, len(inlier) - 1):
+            out[side] = ends[0] + float((at[k] - ends[0]) @ way) * way
+    return out
 
 
 def _stations_on(
@@ -428,14 +449,13 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     distances = np.stack([np.append(line.distance, line.fold_distances) for line in lines])
     vertices, corner = [], []
     if not closed:
-        vertices.append(_foot(normals[0], distances[0], ideal[spans[0][0]]))
+        vertices.append(_foot(normals[0], distances[0], lines[0].ends[0]))
         corner.append(False)
     for k in range(count if closed else count - 1):
         a, b = k, (k + 1) % count
-        joint = 0.5 * (ideal[spans[a][1]] + ideal[spans[b][0]])
-        shorter = min(float(np.linalg.norm(ideal[last] - ideal[first])) for first, last in (spans[a], spans[b]))
+        joint = 0.5 * (lines[a].ends[1] + lines[b].ends[0])
         met = _meet(normals[a], distances[a], normals[b], distances[b])
-        if shorter * _turn(normals[a, 0], normals[b, 0]) / 8.0 > CORNER_SAG_PX:
+        if not _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal):
             vertices.append(met)
             corner.append(True)
             continue
@@ -445,7 +465,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
         corner.append(False)
     if not closed:
-        vertices.append(_foot(normals[-1], distances[-1], ideal[spans[-1][1]]))
+        vertices.append(_foot(normals[-1], distances[-1], lines[-1].ends[1]))
         corner.append(False)
     if closed:
         vertices, corner = vertices[-1:] + vertices[:-1], corner[-1:] + corner[:-1]
@@ -453,6 +473,12 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     uv = from_ideal_px(camera, stacked.reshape(-1, 2)).reshape(stacked.shape)
     rms = np.array([line.rms_px for line in lines])
     return Chain(uv[0], uv[1:], closed, np.array(corner), rms)
+
+
+def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
+    """Whether two pieces approximate a curve, instead of meeting in a corner."""
+    shorter_px = min(float(np.linalg.norm(ideal[last] - ideal[first])) for (first, last), _ in (before, after))
+    return shorter_px * _turn(before[1].normal, after[1].normal) / 8.0 <= CORNER_SAG_PX
 
 
 def _turn(a: Array, b: Array) -> float:
