@@ -5,11 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from support.changing_backgrounds import CAMERA
 
 from gripmon.model.staying import Edges
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
-from gripmon.teach.silhouette import Stations, Transitions, is_outermost
+from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost
+from gripmon.teach.straight_pieces import _joined, _Line
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
@@ -62,3 +64,18 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
         assert np.mean([found(rng, face_px) for _ in range(40)]) < 0.1
     if texture_dn == 0.0:  # before one wall nothing shows
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
+
+
+def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:
+    """A long side is seen less far than its line goes on; halfway across the gap a vertex would tilt it."""
+    a, turn_rad = np.array([101.0, 0.0]), np.radians(10.0)
+    lines, ends = [], [np.array([[0.0, 0.0], [99.5, 0.0]])]
+    ends.append(a + np.array([10.0, 20.0])[:, None] * [np.cos(turn_rad), np.sin(turn_rad)])
+    for end in ends:
+        way = (end[1] - end[0]) / np.linalg.norm(end[1] - end[0])
+        normal = np.array([-way[1], way[0]])
+        distance = float(normal @ end[0])
+        lines.append(_Line(normal, distance, np.tile(normal, (5, 1)), np.full(5, distance), 0.05, end))
+    chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
+    assert not chain.corner.any()
+    assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01

@@ -453,15 +453,18 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         corner.append(False)
     for k in range(count if closed else count - 1):
         a, b = k, (k + 1) % count
-        joint = 0.5 * (lines[a].ends[1] + lines[b].ends[0])
+        gap = lines[b].ends[0] - lines[a].ends[1]
+        joint = lines[a].ends[1] + 0.5 * gap
         met = _meet(normals[a], distances[a], normals[b], distances[b])
         if not _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal):
             vertices.append(met)
             corner.append(True)
             continue
-        # Pieces of a curve meet at their common point: the intersection of nearly parallel lines is uncertain.
+        # Pieces of a curve meet between what is seen of them, on both lines; or, as the intersection of nearly parallel
+        # lines is uncertain, halfway.
         feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
-        near = np.linalg.norm(met[0] - joint) < 2.0
+        share = float(np.clip((met[0] - lines[a].ends[1]) @ gap / max(float(gap @ gap), 1e-9), 0.0, 1.0))
+        near = np.linalg.norm(met[0] - lines[a].ends[1] - share * gap) < 2.0
         vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
         corner.append(False)
     if not closed:
