@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief import bound as bounds
-from gripmon.belief.doubts import Doubt, Onsets, Table, Told, edges_of, nothing_told
+from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
 from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
 from gripmon.belief.rows import add_noise, fade, move
-from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search
+from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search, take_one_of
 from gripmon.belief.state import (
     LATELY_S,
     LEAST_LIGHT_MEMORY,
@@ -109,9 +109,9 @@ class Belief:
         self._bank.spread[0, :, 0, 0] = self.priors.lasting_px**2
         self._hypotheses = self._listed = 1
         self._first, self._lost = True, False
-        self._of_ends = int(np.bitwise_or.reduce(self._table.ends)) if len(self._table.ends) else 0
+        self._of_ends = int(np.bitwise_or.reduce(self._table.ends))
         self._weighed = np.zeros(1, bool)  # of each hypothesis: it sees no end, and a knock since is weighed beside it
-        self._dropped, self._left, self._mean = 0.0, 0.0, np.zeros(SIZE)
+        self._dropped, self._mean = 0.0, np.zeros(SIZE)
 
     @property
     def weights(self) -> dict[int, float]:
@@ -165,8 +165,7 @@ class Belief:
         usual = math.sqrt(2.0 * GUARD * int(seen.shown.sum())) + GUARD
         was_lost, self._lost, self._first = self._lost, not surprise <= usual, False
         if not self._lost:
-            dropped = self._left + self._keep(n, asked)
-            self._left = float(np.sum(np.exp(self._bank.log_weight[self._hypotheses : self._listed])))
+            dropped = self._keep(n, asked)
         else:  # nothing is learnt from what nothing explains
             dropped = 0.0
             if not was_lost:
@@ -219,12 +218,13 @@ class Belief:
         """
         nodes, candidates, jumps = self._nodes, self._candidates, self._jumps
         self._just_weighed = np.zeros(len(candidates.node), bool)
-        ends, i, made = self._ends_seen(asked.seen), 1 + int(candidates.node[:n].max()), dict[tuple[int, int], int]()
+        sees, i = self._see_an_end(n, asked.seen), 1 + int(candidates.node[:n].max())
+        made = dict[tuple[int, int], int]()
         due = math.log(max(self.priors.unseen_knock, 1e-300))
         floor = float(candidates.log_weight[:n].max()) + math.log(self.least) - due + math.log(_OF_SIZES)
         for c in np.flatnonzero(candidates.log_weight[:n] > floor) if self._table.at_ends else ():
             h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
-            if self._is_weighed(int(c)) or nodes.jump[candidates.node[c]] >= 0 or self._sees(int(c), ends):
+            if self._is_weighed(int(c)) or nodes.jump[candidates.node[c]] >= 0 or sees[c]:
                 continue
             self._just_weighed[c] = True
             for j in np.flatnonzero(jumps.knock):
@@ -290,33 +290,30 @@ class Belief:
         remember(
             other, chosen, candidates, nodes, bank, jumps.factors, jumps.ranks, asked.seen, self._table, self._sizes
         )
-        owed = self._owed(chosen, other.log_weight, self._ends_seen(asked.seen))
+        owed = self._owed(chosen, other.log_weight, self._see_an_end(n, asked.seen)[chosen])
+        left = float(np.exp(bank.log_weight[self._hypotheses : self._listed]).sum())  # of the frame before
         self._bank, self._other, self._hypotheses, self._listed = other, bank, len(chosen), listed
-        return float(dropped) + owed
+        return left + float(dropped) + owed
 
-    def _owed(self, chosen: Ints, log_weight: Array, ends: Flags) -> float:
+    def _owed(self, chosen: Ints, log_weight: Array, sees: Flags) -> float:
         """Probability of a knock that isn't weighed beside hypotheses that see no end: they were too light for it."""
         nodes, candidates = self._nodes, self._candidates
         weighed, owed = np.zeros(len(chosen), bool), 0.0
         for q, c in enumerate(chosen) if self._table.at_ends and not self._everything else ():
             jump = nodes.jump[candidates.node[c]]
-            if not self._sees(int(c), ends):
+            if not sees[q]:
                 knocked = jump >= 0 and self._jumps.knock[jump]
                 weighed[q] = knocked or self._is_weighed(int(c)) or self._just_weighed[c]
                 owed += 0.0 if weighed[q] else math.exp(log_weight[q]) * self.priors.unseen_knock
         self._weighed = weighed
         return owed
 
-    def _ends_seen(self, seen: Seen) -> Flags:
-        """(e,) whether an edge at a finger's end is seen better than to an edge's width; else it doesn't tell of it."""
-        edges = np.array([bool((self._table.at_ends >> e) & 1) for e in range(self._edges)])
-        return edges & seen.shown & (seen.strength + seen.white[:, 0, 0] < self.priors.near_px**2)
-
-    def _sees(self, c: int, ends: Flags) -> bool:
-        """Whether a candidate takes one of the edges ``ends`` (e,) for the gripper's, and a line there for it."""
-        doubted = edges_of(int(self._candidates.doubts[c]), self._table.edges)
-        own = self._nodes.line[self._candidates.node[c]] >= 0
-        return any(not (doubted >> e) & 1 for e in np.flatnonzero(ends & own))
+    def _see_an_end(self, n: int, seen: Seen) -> Flags:
+        """(n,) whether candidates take an edge at a finger's end for the gripper's that is seen better than to an
+        edge's width; a worse one doesn't tell of it.
+        """
+        sharp = seen.shown & (seen.strength + seen.white[:, 0, 0] < self.priors.near_px**2)
+        return take_one_of(self._candidates, n, self._nodes, self._table.edges, self._table.at_ends & bits(sharp))
 
     def _not_known(self) -> None:
         """Beside what explains nothing: the pose is anywhere a knock may have brought it."""

@@ -230,7 +230,7 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
     """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
     fingers were longer or shorter by one length, each but for an edge's width.
     """
-    near, another, share, across = sizes[0], sizes[2], sizes[3], sizes[4]
+    near, missed, share, across = sizes[0], sizes[2], sizes[3], sizes[4]
     before = bank.doubts[nodes.parent[i]]
     for k in range(len(table.edges)):
         nodes.across[i, k] = 0.0
@@ -257,7 +257,7 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
         if rows < 4 or along == 0.0:
             continue
         log += 0.5 * (across * cross * cross / (1.0 + across * along) - math.log(1.0 + across * along))
-        share_now = share if fresh else another * share
+        share_now = share if fresh else missed * share
         if share_now > 0.0:
             nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + log - apart)
 

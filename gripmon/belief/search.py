@@ -82,6 +82,20 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
 
 
 @compiled
+def take_one_of(candidates: Candidates, n: int, nodes: Nodes, edges: Ints, asked: int) -> Flags:
+    """(n,) whether each takes one of the edges ``asked`` (bits) for the gripper's, and a line there for it; ``edges``
+    (d,), bits, are those of each doubt.
+    """
+    out = np.zeros(n, np.bool_)
+    for c in range(n):
+        own = asked & ~edges_of(candidates.doubts[c], edges)
+        for edge in range(nodes.line.shape[1]):
+            if (own >> edge) & 1 and nodes.line[candidates.node[c], edge] >= 0:
+                out[c] = True
+    return out
+
+
+@compiled
 def put_all(candidates: Candidates, n: int, nodes: Nodes, i: int, bank: Bank, asked: Asked) -> int:
     """Every set of doubts that is possible."""
     for doubts in range(1 << len(asked.table.edges)):
