@@ -384,3 +384,10 @@ def test_the_limits_are_the_defaults_without_a_word(folder: Path, caplog: pytest
     policy = load_config(folder / "config.yaml").settings.monitor.policy
     assert (policy.alert_limit_m, policy.alert_limit_rad, policy.integrity_risk) == (1e-3, 0.035, 1e-5)
     assert not caplog.messages
+
+
+def test_a_second_cameras_configuration_is_told_what_to_use_now(tmp_path: Path):
+    path = tmp_path / "second.yaml"
+    path.write_text("robot: arm1\ncamera_name: second\nlaser: {calibration: laser.yaml}\n")
+    with pytest.raises(ConfigError, match=r"laser: .* watched by the daemon any more; gripmon check --laser"):
+        load_config(path)

@@ -14,7 +14,7 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.daemon.calibrations import read_calibrated
-from gripmon.daemon.config import ConfigError, is_second, load_config, load_second, read_gripper
+from gripmon.daemon.config import ConfigError, load_config, read_gripper
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.judge.statefile import calibration_of
 from gripmon.model.geometry import to_record
@@ -138,7 +138,6 @@ def test_what_doesnt_belong_together_is_one_clear_line(
     assert line in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("load", [load_config, is_second, load_second])
 @pytest.mark.parametrize(
     ("file", "kind", "key"),
     [
@@ -148,10 +147,10 @@ def test_what_doesnt_belong_together_is_one_clear_line(
     ],
 )
 def test_a_file_that_belongs_into_a_configuration_is_named_and_where(
-    folder: Path, load: Callable[[Path], object], file: str, kind: str, key: str
+    folder: Path, file: str, kind: str, key: str
 ):
     with pytest.raises(ConfigError) as caught:
-        load(folder / file)
+        load_config(folder / file)
     right = f"a configuration, such as gripmon teach writes; this file belongs there under {key}"
     assert str(caught.value) == f"{folder / file}: is {kind}; {right}"
 

@@ -11,10 +11,8 @@ import pytest
 from gripmon.daemon.config import (
     ConfigError,
     builtin_config,
-    is_second,
     load_config,
     load_scenario,
-    load_second,
     read_gripper,
 )
 from gripmon.monitor import MonitorSettings
@@ -27,7 +25,7 @@ GRIPPERS = ROOT / "configs" / "grippers"
 @pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
 def test_shipped_configurations_are_sound_and_every_key_says_its_unit(name: str):
     path = builtin_config(name)
-    (load_second if is_second(path) else load_config)(path, check_source=False)
+    load_config(path, check_source=False)
     for number, line in enumerate(path.read_text().splitlines(), 1):
         has_value = re.match(r"\s*\w+: *[^#\s]", line)
         assert not has_value or " # " in line, f"{path}:{number}: a comment with the unit or the choices is missing"
@@ -66,7 +64,7 @@ def test_scenarios_load_and_refuse(tmp_path: Path):
         load_scenario(path)
 
 
-WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml") if not is_second(path))
+WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
 
 
 @pytest.fixture(params=WRIST)

@@ -13,8 +13,6 @@ from support.gripmon_process import gripmon
 from gripmon.calibrate.opencv_files import DEEPEST, SYNTAXES, nesting
 from gripmon.cli import main
 from gripmon.io.sources import FolderSettings, FolderSource, SourceError
-from gripmon.laser.matching import read_pulses
-from gripmon.model.errors import InputError
 
 DEEP = 100_000
 
@@ -107,9 +105,3 @@ def test_what_opencv_writes_is_far_from_too_deep(tmp_path: Path, suffix: str):
     storage.write("note", "Mon 12:30: as <we> were [told]")
     storage.release()
     assert 1 <= nesting(path.read_bytes()) < DEEPEST // 4
-
-
-def test_an_open_quote_in_a_table_of_pulses_is_one_line(tmp_path: Path):
-    (tmp_path / "pulses.csv").write_text('stamp_ns,until_ns\n"1,2\n' + "x" * 140_000)
-    with pytest.raises(InputError, match=r"pulses.csv: line \d: field larger than .*\(an open quote\?\)"):
-        read_pulses(tmp_path / "pulses.csv")

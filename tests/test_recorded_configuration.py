@@ -7,11 +7,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gripmon.daemon.config import ConfigError, builtin_config, is_second, load_config
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.records import RecordedConfiguration, RecordedFile
 
-SHIPPED = sorted(path for path in builtin_config("demo.yaml").parent.glob("*.yaml") if not is_second(path))
+SHIPPED = sorted(path for path in builtin_config("demo.yaml").parent.glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -7,7 +7,6 @@ import json
 import msgspec
 import pytest
 from support.loopback import alert_record, frame_record, reference_record, state_record
-from support.sample_messages import SAMPLES
 
 from gripmon.model.records import (
     MESSAGES,
@@ -39,8 +38,6 @@ ONE_OF_EACH = {
     "clock": ClockReading("5f2ac301", 5),
     "jaw": JawReading(5, 0.02),
     "frame": FrameNote(stamp_ns=5, jaw_opening_m=0.02, width=768, height=576, encoding="mono8", step=1024),
-    "pulse": SAMPLES["pulse"],
-    "spot": SAMPLES["spot"],
     "command": CommandRequest("plate-2"),
     "reply": CommandReply(CommandName.STATE, True, "well", "plate-2", 3, MonitorState((reference_record(),))),
     "error": CommandError(CommandFault.BUSY, "later"),

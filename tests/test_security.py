@@ -19,14 +19,11 @@ import zenoh
 from support.loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
 from support.published import Published
 from support.router_process import ROOT, running
-from support.sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.daemon.fleet_page import FleetSite, Order
-from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.io.publish.publisher import ZenohSpotPublisher
-from gripmon.io.wire import Link, PublishSettings
+from gripmon.io.wire import PublishSettings
 from gripmon.io.wire.session import load_file
 from gripmon.model.records import CommandName, CommandReply
 from gripmon.teach.messages import BadRequest
@@ -204,29 +201,6 @@ def test_a_camera_is_fed_through_the_rules(site: Site, tmp_path: Path):
         _images = monitor.declare_subscriber(f"{PREFIX}/image", images.append)
         command = ["feed", str(tmp_path), "--robot", "arm", "--zenoh-config", str(site.file("robot"))]
         wait_until(lambda: main(command) == 0 and images, "the image")
-
-
-def test_a_second_cameras_pulses_and_spots_pass_the_rules(site: Site):
-    """The robot tells a pulse, the monitor hears it, a controller reads the spot; no one else may say either."""
-    link = Link(PublishSettings(zenoh_config="monitor.json5"), site.folder)
-    second = ZenohSpotPublisher(link, "arm", "second")
-    pulses = ZenohPulses(link, second.keys["pulse"])
-    spot, pulse = payload("spot"), payload("pulse")
-    read: list[bytes] = []
-    try:
-        with site.session("controller") as controller, site.session("robot") as robot:
-            controller.put(second.keys["pulse"], pulse)
-            _reader = controller.declare_subscriber(
-                second.keys["spot"], lambda sample: read.append(sample.payload.to_bytes())
-            )
-            wait_until(lambda: robot.put(second.keys["spot"], b"666") or second.spot(SAMPLES["spot"]) or read, "a spot")
-            assert set(read) == {spot} and pulses.poll() is None
-            wait_until(lambda: robot.put(second.keys["pulse"], pulse) or pulses.poll() is not None, "the pulse")
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            late = zenoh.ext.declare_advanced_subscriber(controller, second.keys["spot"], history=history)
-            wait_until(lambda: late.try_recv() is not None, "the history of spots")
-    finally:
-        second.close()
 
 
 def test_a_controller_can_neither_speak_for_a_monitor_nor_for_the_jaw(site: Site):

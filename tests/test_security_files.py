@@ -15,7 +15,7 @@ from support.loopback import accepts, free_endpoint
 from support.router_process import ROOT, plain_config, running
 
 from gripmon.cli import main
-from gripmon.daemon.config import is_second, load_config, load_second
+from gripmon.daemon.config import load_config
 from gripmon.io.wire import PublishError, PublishSettings, zenoh_config
 from gripmon.io.wire.session import ZenohFileError, load_file, value_of
 
@@ -56,10 +56,7 @@ def test_shipped_files_stay_on_this_machine_or_speak_tls(folder: Path, name: str
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.name)
 def test_shipped_configurations_stay_on_this_machine(path: Path):
-    second = is_second(path)
-    config = (
-        load_second(path, check_source=False) if second else load_config(path, check_source=False, with_taught=False)
-    )
+    config = load_config(path, check_source=False, with_taught=False)
     settings = config.settings.publish
     assert all(place.startswith(LOOPBACK) for place in (*settings.listen, *settings.connect))
     assert not settings.multicast_scouting and settings.zenoh_config is None

@@ -9,12 +9,12 @@ import pytest
 from support.pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
 from gripmon.calibrate.sighting import NotFound
-from gripmon.laser.judgement import SpotSeen, SpotWatchSettings
+from gripmon.laser.judgement import SpotFault, SpotSeen, SpotWatchSettings
 from gripmon.laser.planning import forecast
 from gripmon.laser.spots import Spot, plain_spot
 from gripmon.laser.watch import SpotWatch
 from gripmon.laser.world import calibrated, predict
-from gripmon.model.records import AlertEvent, AlertKind, Cause, PulseFault, Severity, State, Verdict
+from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,7 @@ def test_wrong_spots_raise_no_drift_and_are_said_to_be_wrong(known):
     assert not raised(judged) and not raised(judged, AlertKind.LOST)
     wrong = [j for j in judged if not j.used]
     assert 8 <= len(wrong) <= 32
-    assert all(j.fault is PulseFault.OUTLIER and "px from where it should be" in j.reason for j in wrong)
+    assert all(j.fault is SpotFault.OUTLIER and "px from where it should be" in j.reason for j in wrong)
     assert all(j.verdict is not Verdict.VALID for j in wrong)
 
 
@@ -223,7 +223,7 @@ def test_spots_that_stay_away_are_an_alert_of_their_own(known):
     ((k, alert),) = raised(judged, AlertKind.LOST)
     assert k == 9 + watch.settings.pulses_until_lost and alert.severity is Severity.ERROR
     assert "laser off" in alert.text and judged[29].state is State.LOST and judged[29].verdict is Verdict.UNKNOWN
-    assert judged[11].state is State.OCCLUDED and judged[10].fault is PulseFault.NO_SPOT
+    assert judged[11].state is State.OCCLUDED and judged[10].fault is SpotFault.NO_SPOT
     assert not raised(judged)
     assert [a.event for j in judged[30:] for a in j.alerts] == [AlertEvent.CLEARED]
     assert judged[-1].state is State.TRACKING
@@ -253,16 +253,16 @@ def test_poses_that_can_show_no_spot_say_nothing(known):
     away[:3, 3] += [3.0, 0.0, 0.0]
     broken = np.full((4, 4), np.nan)
     for pose, fault in (
-        (flat, PulseFault.NOT_FORESEEN),
-        (away, PulseFault.NOT_FORESEEN),
-        (broken, PulseFault.NOT_FINITE),
+        (flat, SpotFault.NOT_FORESEEN),
+        (away, SpotFault.NOT_FORESEEN),
+        (broken, SpotFault.NOT_FINITE),
     ):
         for k in range(10):
             judged = watch.judge(SpotSeen(30_000_000_000 + k, pose, NotFound("no spot")))
             assert judged.fault is fault and judged.reason and not judged.alerts and not judged.used
     assert watch.state is State.TRACKING
     judged = watch.judge(SpotSeen(31_000_000_000, poses()[0], [plain_spot(np.array([np.nan, 3.0]))]))
-    assert judged.fault is PulseFault.NO_SPOT
+    assert judged.fault is SpotFault.NO_SPOT
 
 
 def test_it_begins_by_acquiring_and_can_begin_anew(known):

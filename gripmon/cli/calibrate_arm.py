@@ -93,7 +93,7 @@ def laser(arguments: Arguments) -> None:
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
     from gripmon.laser.samples import plan_table
     from gripmon.model.provenance import provenance_of
-    from gripmon.record.spots import write_calibration
+    from gripmon.record.laser_scene import write_calibration
 
     arguments.check_outputs("out", "picture")
     if arguments.plan is not None and arguments.reach is None:

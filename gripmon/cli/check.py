@@ -13,6 +13,7 @@ from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
     from gripmon.laser.judgement import SpotWatchSettings
+    from gripmon.laser.setup import LaserCalibration
 
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
@@ -72,9 +73,7 @@ def check(arguments: Arguments) -> int:
     With --verbose, also the forecast: where the fingertip corners are in the image (px), which of them and
     which edges are visible, the gripper's distance (mm), the accuracy of one frame along each axis, what the
     view can't separate (an unknown jaw opening and the distance), whether its corners suffice to
-    recalibrate, how far camera and jaws may move until too little is in view.  For a second camera (a
-    configuration with a section laser): its calibration, its standard deviations, and which motions fresh
-    spots would detect.
+    recalibrate, how far camera and jaws may move until too little is in view.
 
     With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
     camera, plane and laser pointer fresh spots would detect, or which they show.
@@ -108,9 +107,7 @@ def _check(arguments: Arguments) -> int:
     else:
         lines = check_text.lines(str(arguments.config[0]), found.findings)
         if arguments.verbose:
-            lines += ["", *([] if found.forecast is None else check_text.details(found.forecast))]
-            lines += [] if found.second is None else check_laser.details(found.second)
-            lines += check_text.surrounding_lines(found.around)
+            lines += ["", *check_text.details(found.forecast), *check_text.surrounding_lines(found.around)]
         print("\n".join(lines))
     if arguments.picture is not None:
         drawn = found.picture(arguments.picture.suffix)
@@ -123,14 +120,13 @@ def _check(arguments: Arguments) -> int:
 
 
 def _check_laser(arguments: Arguments) -> int:
-    from gripmon.daemon.config.second import read_laser
     from gripmon.laser.api import check_laser as judge
     from gripmon.laser.report import check_values, expectation
 
     settings, path = _watch_settings(arguments), arguments.laser
     if not path.is_file():
         raise InputError(f"--laser {path}: there is no such file; a file of gripmon calibrate laser")
-    calibration = read_laser(path)
+    calibration = _read_laser(path)
     if not arguments.config:
         report = expectation(str(path), calibration, settings)
         _print_json(report) if arguments.json else print("\n".join(check_laser.expectation_lines(report)))
@@ -139,6 +135,21 @@ def _check_laser(arguments: Arguments) -> int:
     report = check_values(str(path), calibration, settings, found)
     _print_json(report) if arguments.json else print("\n".join(check_laser.judged_lines(report)))
     return EXIT_DONE if found.verdict == "same" else EXIT_FAILED
+
+
+def _read_laser(path: Path) -> LaserCalibration:
+    from gripmon.calibrate.sighting import CalibrationError
+    from gripmon.daemon.config.typed import ConfigError
+    from gripmon.daemon.config.yaml_file import read_document
+    from gripmon.laser.setup import LaserCalibration
+    from gripmon.laser.watch import SpotWatch
+
+    calibration = read_document(path, LaserCalibration)
+    try:
+        SpotWatch(calibration)  # whether its numbers make a set-up
+    except (CalibrationError, ValueError) as error:
+        raise ConfigError(path, "", str(error)) from None
+    return calibration
 
 
 def _watch_settings(arguments: Arguments) -> SpotWatchSettings:

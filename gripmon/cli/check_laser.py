@@ -1,4 +1,4 @@
-"""The output of ``gripmon check`` for a laser calibration, and for a second camera that monitors one."""
+"""The output of ``gripmon check`` for a laser calibration."""
 
 from __future__ import annotations
 
@@ -6,52 +6,6 @@ import math
 from typing import Any
 
 _AXES = ("x", "y", "z")
-
-
-def details(report: dict[str, Any]) -> list[str]:
-    """A second camera's configuration."""
-    sections = {
-        "second": f"{report['robot']}/{report['camera_name']}, watched by a pulsed laser",
-        "camera": _calibration_line(report["calibration"]),
-        "known": _known_line(report["calibration"]["sigmas"]),
-        "watch": _watch_line(report["watch"]),
-        "pulses": _pulses_line(report["pulses"]),
-    }
-    lines = [f"{name:<10} {text}" for name, text in sections.items()]
-    return lines + expectation_lines(report["foreseen"])[1:]
-
-
-def _calibration_line(calibration: dict[str, Any]) -> str:
-    x, y, z = (1e3 * value for value in calibration["translation_m"])
-    return (
-        f"{calibration['width_px']} x {calibration['height_px']} px at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the base, its "
-        f"plane {1e3 * calibration['distance_m']:.0f} mm away; {calibration['id']} of {calibration['file']}, "
-        f"{calibration['used']} of {calibration['spots']} spots, RMS {calibration['rms_px']:.2f} px"
-    )
-
-
-def _known_line(sigmas: dict[str, float]) -> str:
-    """Standard deviations of known parameters; a file may have others."""
-    place = [1e3 * sigmas[f"base_T_cam.{axis}_m"] for axis in "xyz" if f"base_T_cam.{axis}_m" in sigmas]
-    turn = [math.degrees(sigmas[f"base_T_cam.r{axis}_rad"]) for axis in "xyz" if f"base_T_cam.r{axis}_rad" in sigmas]
-    return (
-        f"camera to ± {', '.join(f'{value:.2f}' for value in place)} mm and "
-        f"± {', '.join(f'{value:.3f}' for value in turn)}° in the base (one standard deviation)"
-    )
-
-
-def _watch_line(watch: dict[str, Any]) -> str:
-    return (
-        f"arm exact to {1e3 * watch['arm_noise_m']:g} mm and {1e3 * watch['arm_noise_rad']:g} mrad; a warning from "
-        f"{1e3 * watch['warn_m']:g} mm, an error from {1e3 * watch['limit_m']:g} mm"
-    )
-
-
-def _pulses_line(pulses: dict[str, Any]) -> str:
-    if pulses["table"] is None:
-        return f"by the robot's program on {pulses['key']}"
-    length_s = 1e-9 * (pulses["last_ns"] - pulses["first_ns"])
-    return f"{pulses['count']} in {pulses['table']}, over {length_s:.4g} s"
 
 
 def expectation_lines(report: dict[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
 
 _MESSAGES = (
-    "transform", "state", "alert", "reference", "clock", "jaw", "frame", "pulse", "spot", "command", "reply", "error",
+    "transform", "state", "alert", "reference", "clock", "jaw", "frame", "command", "reply", "error",
 )  # fmt: skip
 
 _FEED_OPTIONS = f"""

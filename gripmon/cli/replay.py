@@ -34,7 +34,6 @@ _EXAMPLES = """\
 
   gripmon replay recordings/ --out again.jsonl                             all files of one run
   gripmon replay set/ --episode 12 --config wrist.yaml --out 12.jsonl      of a LeRobot dataset
-  gripmon replay pulses/images --config second.yaml --out spots.jsonl      a second camera's pulses
   gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
 exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used, or writing failed (an
@@ -55,8 +54,6 @@ def replay(arguments: Arguments) -> int:
     changed; --recording then shows both runs, recorded and replayed, in one view.  The last line reports
     how many frames were judged differently.
 
-    With the configuration of a second camera (a section laser) INPUT is a folder or a video, its pulses
-    come from the table laser.pulses, and every pulse gets a line.
     """
     import cv2
 

@@ -14,7 +14,7 @@ VIEW_OPTION = """
 _OPTIONS = f"""
 CONFIG         configuration file (YAML)
 --duration S   stop after this time (s); default: never
---out DIR      folder for the recording and estimates.jsonl (one JSON line per frame; spots.jsonl, one per pulse);
+--out DIR      folder for the recording and estimates.jsonl (one JSON line per frame);
                created if missing; existing files are kept (estimates-1.jsonl …) within daemon.estimates_budget_bytes
 --fresh-state  start from the configured reference; a kept state is set aside as <file>.replaced-<n>
 --take-over    start even if another monitor of this robot and camera is on the network; nothing is usable until
@@ -32,12 +32,10 @@ _EXAMPLES = """\
   gripmon send undo --robot arm1                         back to the previous reference
   gripmon run configs/live_camera.yaml --view web        show it live in a browser, on this machine
 
-  gripmon run configs/second_camera.yaml                 a fixed camera, monitored with a pulsed laser
 
-Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}; a second
-camera's on {spot,state,alert}, and it receives pulses on …/pulse.
+Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}.
 exit codes: 0 the source ended, the time was over, or SIGTERM; 2 wrong usage or configuration; 3 no
-usable frame, pulses of which none showed its spot, or an internal error that persisted; 4 another
+usable frame, or an internal error that persisted; 4 another
 monitor of this robot and camera is on the network; 130 Ctrl-C"""
 
 
@@ -53,9 +51,6 @@ def run(arguments: Arguments) -> int:
     that state.file names: for a live camera in ~/.local/state/gripmon.  After a restart the monitor
     continues from the last reference, checks that the image fits it, and reports this (alert restarted).
 
-    A configuration with a section laser is that of a second camera, beside the robot: its calibration is
-    tested with every pulse of a laser pointer on the arm that the robot's program reports
-    (docs/howto/laser.md, Watching).
     """
     with signals_exit() as stop:
         from gripmon.daemon.starting import run_file

@@ -10,7 +10,7 @@ from collections.abc import Sized
 from pathlib import Path
 
 from gripmon import monitor
-from gripmon.daemon.config import Config, ConfigError, SecondConfig
+from gripmon.daemon.config import Config, ConfigError
 from gripmon.io.sources import (
     EpisodeSettings,
     FolderSettings,
@@ -80,16 +80,15 @@ def open_source(source: str | Path | SourceSettings | Config, fps: float | None 
     return OpenedSource(start(source))
 
 
-def open_configured(config: Config | SecondConfig, link: Link | None = None) -> Source:
+def open_configured(config: Config, link: Link | None = None) -> Source:
     """Start the configured source, on the network through ``link``.  Raises :class:`ConfigError` if it can't start."""
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
-    scene = None if isinstance(config, SecondConfig) else config.scene
     keys = Keys(settings.robot, settings.camera_name)
     try:
-        source = start(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
+        source = start(settings.source, config.directory, scene=config.scene, size_px=size_px, link=link, keys=keys)
     except SourceError as error:
         raise ConfigError(config.path, "", f"source.{error}") from None
-    bit_depth = 16 if isinstance(config, SecondConfig) else config.settings.monitor.bit_depth
+    bit_depth = settings.monitor.bit_depth
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 
 
@@ -98,7 +97,7 @@ ROUNDED_OPENING_M = 1e-6
 digits."""
 
 
-def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
+def look_ahead(config: Config) -> tuple[str, str | None] | None:
     """A description of the first recorded frame, and what is odd about it (None: nothing); None for a source that isn't
     recorded.
 
@@ -115,17 +114,14 @@ def look_ahead(config: Config | SecondConfig) -> tuple[str, str | None] | None:
     height_px, width_px = frame.image.shape[:2]
     camera = config.camera
     if (width_px, height_px) != (camera.width_px, camera.height_px):
-        key = "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"
         wrong = f"{camera.width_px} x {camera.height_px} px; {frame.name} is {width_px} x {height_px}"
-        raise ConfigError(config.path, key, wrong, "the calibration that belongs to these images")
+        raise ConfigError(config.path, "camera.width_px", wrong, "the calibration that belongs to these images")
     count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
     detail = f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
     if unreadable:
         first, *more = unreadable
         others = f", nor can the next {len(more)}" if more else ""
         return detail, f"its first frame can't be read ({first}){others}"
-    if isinstance(config, SecondConfig):
-        return detail, None
     odd = [each for each in (unlike_light(config, frame.image), _unused_opening(config, frame)) if each]
     return detail, "; ".join(odd) or None
 
@@ -150,7 +146,7 @@ def _unused_opening(config: Config, frame: Frame) -> str | None:
     return f"{told}, which jaw.source: fixed doesn't use: it takes them to be {1e3 * fixed_m:g} mm; jaw.source: frames"
 
 
-def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:
+def _first_readable(config: Config, source: Source) -> tuple[Frame, list[str]]:
     """The first frame with an image, and why those before it have none."""
     unreadable: list[str] = []
     while isinstance(frame := source.read(), Frame):

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import IO
 
-from gripmon.model.records import FrameRecord, SpotRecord, to_json
+from gripmon.model.records import FrameRecord, to_json
 
 _log = logging.getLogger(__name__)
 _BUFFER_BYTES = 1 << 16
@@ -31,7 +31,7 @@ class EstimatesFile:
         self._path, self._budget_bytes = path, budget_bytes
         self._file: IO[bytes] | None = None if path is None else self._begin(path)
 
-    def write(self, record: FrameRecord | SpotRecord) -> None:
+    def write(self, record: FrameRecord) -> None:
         """Add a line; it is written by the next :meth:`flush`."""
         if self._file is not None:
             try:

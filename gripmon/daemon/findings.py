@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from gripmon.daemon.api import look_ahead
-from gripmon.daemon.config import Config, SecondConfig, check_network, is_second, load_config, load_second
+from gripmon.daemon.config import Config, check_network, load_config
 from gripmon.daemon.forecast import forecast
 from gripmon.daemon.forecast_values import (
     CameraValues,
@@ -33,8 +33,6 @@ from gripmon.daemon.promised import Level, by_forecast, images_of, kept_of, over
 from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Joining, Keys
-from gripmon.laser.report import expectation
-from gripmon.model.errors import InputError
 from gripmon.teach.kept import Kept
 
 _NOT_SQUARE = 0.02
@@ -74,12 +72,11 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """A checked configuration: for a wrist camera a ``forecast``, for a second camera plain values (m, rad, px, ns),
-    and the surroundings; ``kept``: what the monitor says over the ``images``, None where there are none.
+    """A checked configuration: a ``forecast`` and the surroundings; ``kept``: what the monitor says over the
+    ``images``, None where there are none.
     """
 
-    forecast: Forecast | None
-    second: dict[str, Any] | None
+    forecast: Forecast
     around: Surroundings
     kept: Kept | None = None
     images: str = ""
@@ -94,44 +91,31 @@ class CheckResult:
     def values(self) -> dict[str, Any]:
         """Everything as plain values for JSON."""
         around = msgspec.to_builtins(self.around)
-        if self.second is not None:
-            return {**self.second, **around}
         kept = {"kept": msgspec.to_builtins(self.kept), "kept_over": self.images}
         return {**msgspec.to_builtins(self.forecast), **kept, **around}
 
     @property
     def findings(self) -> list[Finding]:
         """What to know about the configuration before it runs."""
-        about = (
-            _of_second(self.second or {}) if self.forecast is None else _of_wrist(self.forecast, self.kept, self.images)
-        )
         keys = self.around.keys
         network = Finding("OK", "network", "off" if keys is None else f"Zenoh keys {keys}…")
-        found = [_source(self.around.source), *about, network]
+        found = [_source(self.around.source), *_of_config(self.forecast, self.kept, self.images), network]
         return [each for each in found if each is not None]
 
 
 def check_file(path: Path, images: Path | None = None) -> CheckResult:
-    """Check a configuration file of a wrist camera or a second camera.  ``images``: of the gripper at the reference,
-    to judge by instead of the configuration's own.  Raises :class:`ConfigError`, and :class:`NoResultError` if a laser
-    calibration or recorded frames can't be used.
+    """Check a configuration file.  ``images``: of the gripper at the reference, to judge by instead of the
+    configuration's own.  Raises :class:`ConfigError`, and :class:`NoResultError` if recorded frames can't be used.
     """
-    if not is_second(path):
-        config = load_config(path)
-        around, foreseen, found = _look_around(config), forecast(config), images_of(config, images)
-        if found is None or not foreseen.in_view.enough:
-            return CheckResult(foreseen, None, around)
-        said = kept_of(config, found)
-        return CheckResult(foreseen, None, around, said, found.what, partial(picture_of, config, found, said))
-    if images is not None:
-        raise InputError("is for wrist cameras; leave it out", "images")
-    second = load_second(path)
-    around, watch = _look_around(second), second.settings.laser.watch
-    expected = expectation(str(second.calibration_path), second.calibration, watch)
-    return CheckResult(None, {**_second_values(second), "foreseen": expected}, around)
+    config = load_config(path)
+    around, foreseen, found = _look_around(config), forecast(config), images_of(config, images)
+    if found is None or not foreseen.in_view.enough:
+        return CheckResult(foreseen, around)
+    said = kept_of(config, found)
+    return CheckResult(foreseen, around, said, found.what, partial(picture_of, config, found, said))
 
 
-def _look_around(config: Config | SecondConfig) -> Surroundings:
+def _look_around(config: Config) -> Surroundings:
     """Check what the configuration names; nothing is joined or started except a connection to a camera's address.
 
     Raises :class:`ConfigError` for a network that can't be joined or frames that don't fit, and :class:`NoResultError`
@@ -148,7 +132,7 @@ def _look_around(config: Config | SecondConfig) -> Surroundings:
     )
 
 
-def _source_report(config: Config | SecondConfig) -> SourceReport:
+def _source_report(config: Config) -> SourceReport:
     source = config.settings.source
     kind = str(type(source).__struct_config__.tag)
     if (recorded := look_ahead(config)) is not None:
@@ -179,7 +163,7 @@ def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
     return None, f"{shown_name(device)}; only running it shows whether it delivers"
 
 
-def _of_wrist(forecast: Forecast, kept: Kept | None, images: str) -> list[Finding | None]:
+def _of_config(forecast: Forecast, kept: Kept | None, images: str) -> list[Finding | None]:
     return [
         _camera(forecast.camera),
         _jaw_motion(forecast.gripper),
@@ -189,20 +173,6 @@ def _of_wrist(forecast: Forecast, kept: Kept | None, images: str) -> list[Findin
         None if forecast.doubt is None else Finding("WARN", "reference", forecast.doubt),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
-    ]
-
-
-def _of_second(report: dict[str, Any]) -> list[Finding]:
-    calibration, watch, pulses = report["calibration"], report["watch"], report["pulses"]
-    spots = f"{calibration['used']} of {calibration['spots']} spots, RMS {calibration['rms_px']:.2f} px"
-    size = f"{calibration['width_px']} x {calibration['height_px']} px"
-    limits = f"a warning from {1e3 * watch['warn_m']:g} mm, an error from {1e3 * watch['limit_m']:g} mm"
-    table = pulses["table"]
-    origin = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
-    return [
-        Finding("OK", "calibration", f"{size}, {spots}"),
-        Finding("OK", "watch", limits),
-        Finding("OK", "pulses", origin),
     ]
 
 
@@ -322,43 +292,3 @@ def _recalibration(values: RecalibrationForecast) -> Finding:
         text = f"the reference can't be measured again from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
     return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
-
-
-def _second_values(config: SecondConfig) -> dict[str, Any]:
-    """Plain values for JSON: metres, radians, px, ns."""
-    settings, calibration = config.settings, config.calibration
-    camera, residuals, watch = config.camera, calibration.residuals, config.settings.laser.watch
-    pulses = config.pulses
-    return {
-        "config": str(config.path),
-        "robot": settings.robot,
-        "camera_name": settings.camera_name,
-        "calibration": {
-            "file": str(config.calibration_path),
-            "time": calibration.provenance.time,
-            "id": config.pulsed_watch().reference_id,
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "spots": residuals.spots,
-            "used": residuals.used,
-            "rms_px": residuals.rms_px,
-            "distance_m": calibration.plane.distance_cam_m,
-            "translation_m": list(calibration.base_T_cam.translation_m),
-            "rotation_xyzw": list(calibration.base_T_cam.rotation_xyzw),
-            "sigmas": dict(calibration.sigmas),
-        },
-        "watch": {
-            "false_alarms_per_1000_pulses": watch.false_alarms_per_1000_pulses,
-            "arm_noise_m": watch.arm_noise_m,
-            "arm_noise_rad": watch.arm_noise_rad,
-            "warn_m": watch.warn_m,
-            "limit_m": watch.limit_m,
-        },
-        "pulses": {
-            "key": None if settings.laser.pulses else f"gripmon/{settings.robot}/{settings.camera_name}/pulse",
-            "table": None if settings.laser.pulses is None else str(config.directory / settings.laser.pulses),
-            "count": len(pulses) if settings.laser.pulses else None,
-            "first_ns": pulses[0].stamp_ns if pulses else None,
-            "last_ns": pulses[-1].until_ns if pulses else None,
-        },
-    }

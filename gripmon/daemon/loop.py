@@ -69,9 +69,6 @@ class Daemon(Loop):
         self._deliver("state's keeping", self._keep_now)
         self._make_reference_known()
 
-    def _between(self) -> None:
-        """Nothing to do between frames."""
-
     def _finish(self) -> None:
         self._beside.shutdown()
         self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))

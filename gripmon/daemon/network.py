@@ -6,14 +6,14 @@ import contextlib
 import dataclasses
 import logging
 
-from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_network
+from gripmon.daemon.config import Config, ConfigError, check_network
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
 from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import ZenohCommands
-from gripmon.io.publish.inputs import ZenohJaw, ZenohPulses, opening_of_joints
+from gripmon.io.publish.inputs import ZenohJaw, opening_of_joints
 from gripmon.io.publish.presence import Presence, in_words
-from gripmon.io.publish.publisher import Publishers, ZenohPublisher, ZenohSpotPublisher
+from gripmon.io.publish.publisher import Publishers, ZenohPublisher
 from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
 from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
 from gripmon.io.ros2.publisher import Ros2Publisher
@@ -32,24 +32,23 @@ class NameTakenError(NoResultError):
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """The session (None: nothing is published), the publisher, the sources of the jaw opening (None: the frames), of a
-    laser's pulses and of commands, and the reports of all these for the state message.
+    """The session (None: nothing is published), the publisher, the sources of the jaw opening (None: the frames) and
+    of commands, and the reports of all these for the state message.
     """
 
     link: Link | None
     publisher: Publisher
     jaw: JawFeed | None = None
-    pulses: ZenohPulses | None = None
     commands: ZenohCommands | None = None
     reports: Reports = dataclasses.field(default_factory=Reports)
 
 
-def open_network(config: Config | SecondConfig, *, take_over: bool = False) -> Network:
+def open_network(config: Config, *, take_over: bool = False) -> Network:
     """Open the network.  Raises :class:`ConfigError` if it can't be opened as configured, and :class:`NameTakenError`
     if another monitor has the same robot and camera name, unless ``take_over``.
     """
     jaw = None
-    if isinstance(config, Config) and config.settings.jaw.source == "fixed":
+    if config.settings.jaw.source == "fixed":
         jaw = _FixedJaw(config.jaw_opening_m)
     network = Network(None, Publisher(), jaw)
     link = _open_link(config)
@@ -58,21 +57,18 @@ def open_network(config: Config | SecondConfig, *, take_over: bool = False) -> N
         with contextlib.ExitStack() as failed:
             failed.callback(link.close)  # the process must not end while its session is being opened
             presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
-            if isinstance(config, SecondConfig):
-                network = _second_on_link(config, link, presence)
-            else:
-                network = _on_link(config, link, jaw, presence)
+            network = _on_link(config, link, jaw, presence)
             failed.pop_all()
     return _with_metrics(config, network)
 
 
-def _open_link(config: Config | SecondConfig) -> Link | None:
+def _open_link(config: Config) -> Link | None:
     """The session, None if nothing is published."""
     check_network(config)
     settings = config.settings
     if not settings.publish.enabled:
         return None
-    publish = network_of(settings.publish, config.settings.ros2) if isinstance(config, Config) else settings.publish
+    publish = network_of(settings.publish, settings.ros2)
     if publish != settings.publish:
         _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(publish.connect))
     try:
@@ -106,21 +102,10 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
     reports = Reports(
         faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
     )
-    return Network(link, publishers, jaw, None, commands, reports)
+    return Network(link, publishers, jaw, commands, reports)
 
 
-def _second_on_link(config: SecondConfig, link: Link, presence: Presence) -> Network:
-    settings = config.settings
-    publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name, presence)
-    pulses = ZenohPulses(link, publisher.keys["pulse"]) if settings.laser.pulses is None else None
-    commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
-    heard = [each for each in (pulses, commands) if each is not None]
-    faults = [link.fault] if pulses is None else [link.fault, pulses.fault]
-    reports = Reports(faults, malformed=lambda: sum(each.malformed for each in heard), others=presence.others)
-    return Network(link, publisher, None, pulses, commands, reports)
-
-
-def _with_metrics(config: Config | SecondConfig, network: Network) -> Network:
+def _with_metrics(config: Config, network: Network) -> Network:
     """Add the metrics server for Prometheus to the publisher if configured.  Raises :class:`ConfigError` if it can't
     listen.
     """

@@ -8,7 +8,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence, Sized
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import NEGLIGIBLE_PX, compare_cameras
 from gripmon.daemon.api import Monitor, open_source
-from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_pulses, load_second
+from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.recorded_run import RecordedRun, one_recording
@@ -45,7 +45,6 @@ from gripmon.model.records import (
     MonitorState,
     Origin,
     RecordedCommand,
-    SpotRecord,
     unmeasured_record,
 )
 from gripmon.monitor import warm_up
@@ -215,47 +214,6 @@ class FrameReplay:
         return self._counts.usable > 0
 
 
-class PulseReplay:
-    """A replay of a second camera, with the pulses of its table."""
-
-    def __init__(self, source: Source, config: SecondConfig) -> None:
-        self._source, self._config = source, config
-        self._count = self._used = 0
-        self._faults: Counter[str] = Counter()
-        self.length = len(source) if isinstance(source, Sized) else None
-
-    def recorded_in(self, path: Path | None) -> AbstractContextManager[None]:
-        """A replay of a second camera can't be recorded."""
-        if path is not None:
-            right = "gripmon run with source: {kind: folder} and --out records"
-            raise InputError(f"is for wrist cameras; {right}", "recording")
-        return nullcontext()
-
-    def records(self, step: Callable[[], None]) -> Iterator[SpotRecord]:
-        """One record per pulse; ``step`` is called after each frame."""
-        for record in self._config.pulsed_watch().replayed(self._frames(step), self._config.pulses):
-            yield record
-            self._count, self._used = self._count + 1, self._used + record.used
-            if record.fault is not None:
-                self._faults[record.fault] += 1
-
-    def summary(self) -> list[str]:
-        """A summary of the pulses."""
-        why = ", ".join(f"{number} {fault}" for fault, number in self._faults.most_common())
-        return [f"{self._count} pulses: {self._used} used{f'; {why}' if why else ''}"]
-
-    @property
-    def usable(self) -> bool:
-        """Whether any pulse was used."""
-        return self._used > 0
-
-    def _frames(self, step: Callable[[], None]) -> Iterator[Frame]:
-        while (item := self._source.read()) is not None:
-            step()
-            if isinstance(item, Frame):
-                yield item
-
-
 @contextmanager
 def open_replay(
     paths: Sequence[Path],
@@ -265,7 +223,7 @@ def open_replay(
     *,
     camera: str | None = None,
     episode: int | None = None,
-) -> Iterator[FrameReplay | PulseReplay]:
+) -> Iterator[FrameReplay]:
     """Open a folder of images, a video, an episode, or recordings of one run for a replay with a configuration (None:
     the recorded one); ``fps`` as for :func:`gripmon.open_source`.  ``camera`` and ``episode`` select one of several
     (None: as in the configuration's source).  ``warn`` is called with one line for each oddity.
@@ -276,18 +234,6 @@ def open_replay(
     _refuse_empty_folders(paths)
     recorded = _are_recordings(paths)
     with contextlib.ExitStack() as opened:
-        if config_path is not None and is_second(config_path):
-            second = load_second(config_path, check_source=False)
-            if second.settings.laser.pulses is None:
-                raise ConfigError(config_path, "laser.pulses", "is missing", "a table of the recorded pulses")
-            if recorded or len(paths) > 1:
-                right = "one folder of images, or one video"
-                raise InputError(f"{first}: no input for a second camera's configuration; {right}")
-            second = load_pulses(second)
-            source = _open_input(first, fps, None, camera, episode)
-            opened.callback(source.close)
-            yield PulseReplay(source, second)
-            return
         given = None if config_path is None else load_config(config_path, check_source=False)
         run = RecordedRun(paths, given, opened) if recorded else None
         config = given if run is None else run.config

@@ -9,7 +9,7 @@ import contextlib
 import gc
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -18,13 +18,9 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import JawFeed, Reports
-from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.supervised import Parts
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish.inputs import ZenohPulses
-from gripmon.laser.matching import ReportedPulse
-from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import FrameRecord, Image, Outlines
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
@@ -60,26 +56,6 @@ def run(
     with _closing(parts, estimates, jaw, keeper, outlines) as lines:
         daemon = Daemon(monitor, estimates=lines, jaw=jaw, keeper=keeper, odd_about=odd_about, **parts)
         return daemon.run(duration_s)
-
-
-def run_second(
-    pulsed: PulsedWatch,
-    *,
-    lines: Path | None = None,
-    table: Sequence[ReportedPulse] = (),
-    feed: ZenohPulses | None = None,
-    no_spot_alert_after_s: float | None = None,
-    duration_s: float | None = None,
-    **parts: Unpack[Parts],
-) -> int:
-    """The same for a second camera: see :class:`SecondCamera`.  ``lines``: a file that gets one JSON line per pulse.
-
-    Returns the exit code, which is also 3 if no pulse had a usable spot.
-    """
-    with _closing(parts, lines) as file:
-        return SecondCamera(
-            pulsed, lines=file, table=table, feed=feed, no_spot_alert_after_s=no_spot_alert_after_s, **parts
-        ).run(duration_s)
 
 
 @contextlib.contextmanager

@@ -15,13 +15,13 @@ from typing import Any
 import cv2
 
 from gripmon.daemon.api import Monitor, look_ahead, open_configured, unlike_light
-from gripmon.daemon.config import Config, ConfigError, SecondConfig, is_second, load_config, load_second
+from gripmon.daemon.config import Config, ConfigError, load_config
 from gripmon.daemon.config.checks import reference_doubt
-from gripmon.daemon.config.recorded import second_to_recorded, to_recorded
+from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.network import open_network, with_source
-from gripmon.daemon.running import run, run_second
+from gripmon.daemon.running import run
 from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Source
 from gripmon.judge.statefile import StateFile, StateFileError
@@ -52,26 +52,21 @@ def run_file(
     view: str | None = None,
     take_over: bool = False,
 ) -> int:
-    """Run the daemon on a configuration file of a wrist camera or second camera; returns the exit code.
+    """Run the daemon on a configuration file; returns the exit code.
 
-    ``out``: a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), created if missing.  ``view``:
+    ``out``: a folder for the recording and ``estimates.jsonl``, created if missing.  ``view``:
     "auto", "web", "native" or "server"; ``verbose`` and ``log_json``: see
     :func:`gripmon.daemon.service.log_to_stderr`; the rest as in :func:`run_monitor`.
     """
-    config = load_second(path) if is_second(path) else load_config(path)
-    second = isinstance(config, SecondConfig)
-    if second and fresh_state:
-        raise InputError(f"is for wrist cameras, {path} is a second camera's; leave it out", "fresh_state")
+    config = load_config(path)
     look_ahead(config)
     if out is not None:
-        lines = writable_folder(out) / ("spots.jsonl" if second else "estimates.jsonl")
+        lines = writable_folder(out) / "estimates.jsonl"
         try:
             lines.open("ab").close()
         except OSError as error:
             raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
     log_to_stderr(verbose=verbose, as_json=log_json)
-    if isinstance(config, SecondConfig):
-        return _run_second(config, out, stop, duration_s, view, take_over=take_over)
     return run_monitor(
         config, out=out, stop=stop, duration_s=duration_s, keep_state=True, fresh_state=fresh_state,
         view=view, take_over=take_over,
@@ -168,51 +163,6 @@ def _outlines(config: Config, record: FrameRecord) -> Outlines:
     return outlines_of(config.camera, config.gripper, record)
 
 
-def _run_second(
-    config: SecondConfig,
-    out: Path | None,
-    stop: StopRequest,
-    duration_s: float | None,
-    view: str | None,
-    *,
-    take_over: bool,
-) -> int:
-    """The same for a second camera, which has no state."""
-    settings = config.settings
-    cv2.setNumThreads(1)
-    live = None if view is None else LiveView(settings.view, view, config.path)
-    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
-        pulsed = config.pulsed_watch()
-        network = open_network(config, take_over=take_over)
-        opened.callback(network.publisher.close)
-        source = open_configured(config, network.link)
-        opened.callback(source.close)
-        recorder = _open_recorder(
-            config, out, source, live, laser=config.calibration, configuration=second_to_recorded(config)
-        )
-        opened.callback(recorder.close)
-        if live is not None:
-            live.open(viewed)
-        opened.pop_all()  # from here on the daemon closes them
-        return run_second(
-            pulsed,
-            source=source,
-            publisher=network.publisher,
-            recorder=recorder,
-            settings=settings.daemon,
-            robot=settings.robot,
-            camera=settings.camera_name,
-            lines=None if out is None else out / "spots.jsonl",
-            table=config.pulses,
-            feed=network.pulses,
-            no_spot_alert_after_s=settings.laser.no_spot_alert_after_s,
-            commands=network.commands,
-            reports=with_source(network.reports, source),
-            duration_s=duration_s,
-            stop=stop,
-        )
-
-
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     """The state file; None without one."""
     path = config.state_path
@@ -235,9 +185,9 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 
 
 def _open_recorder(
-    config: Config | SecondConfig, out: Path | None, source: Source, live: LiveView | None, **recorded: Any
+    config: Config, out: Path | None, source: Source, live: LiveView | None, **recorded: Any
 ) -> Recorder:
-    """For either kind of camera; ``recorded``: arguments of :func:`gripmon.record.write.open_recorder`."""
+    """``recorded``: arguments of :func:`gripmon.record.write.open_recorder`."""
     settings, patience_s = config.settings, 0.0 if source.live else RECORDING_PATIENCE_S
     view = None if live is None else live.settings
     try:

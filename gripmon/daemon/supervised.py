@@ -76,9 +76,6 @@ class Parts(TypedDict, total=False):
 class Loop(ABC):
     """Runs in the thread that calls :meth:`run`.  Subclasses process and judge the frames."""
 
-    verdict_of = "transform"
-    """What the verdict is about, for the log."""
-
     def __init__(self, **parts: Unpack[Parts]) -> None:
         self._source = parts["source"]
         self._publisher, self._recorder = parts["publisher"], parts["recorder"]
@@ -114,10 +111,6 @@ class Loop(ABC):
     @abstractmethod
     def _handle(self, frame: Frame) -> None:
         """Judge a frame and pass on the results."""
-
-    @abstractmethod
-    def _between(self) -> None:
-        """Called before every read of the source; must return quickly."""
 
     @abstractmethod
     def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
@@ -163,7 +156,6 @@ class Loop(ABC):
     def _next_item(self) -> bool:
         """Wait for the source and handle its item; False if there is nothing more to do."""
         self._handle_command()
-        self._between()
         if not self._source.live and not self._recorder.has_room:
             time.sleep(ROOM_POLL_S)
             self._publish_state(time.monotonic())
@@ -302,7 +294,7 @@ class Loop(ABC):
             _log.warning("%s (or reject)", waits)
         if last is None or (watch.state, verdict) != (last.state, last.verdict):
             because = f" ({message})" if message else ""
-            line = f"state {watch.state}, {self.verdict_of} {verdict}{because}"
+            line = f"state {watch.state}, transform {verdict}{because}"
             _log.info("%s", line)
             self._service.status(line)
         self._last_state = self._state_record(verdict, message, now_s, alone=not several)

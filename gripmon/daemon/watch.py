@@ -72,7 +72,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         int,
         msgspec.Meta(
             ge=0,
-            description="limit for estimates.jsonl (spots.jsonl) of run --out together with the earlier ones "
+            description="limit for estimates.jsonl of run --out together with the earlier ones "
             "kept beside it: each file is a tenth of this, and beyond it the oldest are deleted; "
             "0: one file without limit (bytes)",
         ),
@@ -129,10 +129,7 @@ class Watch:
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; returns the alerts that are due besides the record's own."""
-        return self.judged(_of_record(record), now_s)
-
-    def judged(self, frame: FrameOutcome, now_s: float) -> list[Alert]:
-        """The same for a frame of either kind of camera."""
+        frame = _of_record(record)
         alerts = self._end_of_silence(now_s)
         self.frames += 1
         self.frames_usable += frame.usable

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Annotated
 
 import msgspec
@@ -14,19 +15,26 @@ from msgspec import Meta
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.beliefs import KINDS, MOVED, SCALES, Beliefs, MotionTest
 from gripmon.laser.spots import Spot
-from gripmon.laser.world import CAMERA, Calibrated, World, predict, predict_moved
+from gripmon.laser.world import CAMERA, Calibrated, SpotGap, World, predict, predict_moved
 from gripmon.model.records import (
     Alert,
     AlertKind,
     Array,
     Cause,
     CauseWeight,
-    PulseFault,
     Severity,
-    SpotGap,
     State,
     Verdict,
 )
+
+
+class SpotFault(StrEnum):
+    """Why a spot was not judged, or was rejected."""
+
+    NO_SPOT = "no_spot"
+    OUTLIER = "outlier"
+    NOT_FORESEEN = "not_foreseen"
+    NOT_FINITE = "not_finite"
 
 
 class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -141,7 +149,7 @@ class SpotJudgement:
     square: float | None = None
     spots_base_m: Array | None = None
     disagreements: tuple[SpotGap, ...] = ()
-    fault: PulseFault | None = None
+    fault: SpotFault | None = None
     reason: str = ""
     probability_moved: float = 0.0
     causes: tuple[CauseWeight, ...] = ()
@@ -335,13 +343,13 @@ def _moved_text(
     return f"{text}: the laser pointer moved on the arm, turned by {turn:.3f} degrees, shifted by {shift:.2f} mm"
 
 
-def lost_alert(faults: Sequence[PulseFault]) -> Alert:
+def lost_alert(faults: Sequence[SpotFault]) -> Alert:
     """The alert after too many successive pulses without an accepted spot."""
     return Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, _lost(len(faults), faults))
 
 
-def _lost(pulses: int, faults: Sequence[PulseFault]) -> str:
-    seen = sum(fault is PulseFault.OUTLIER for fault in faults)
+def _lost(pulses: int, faults: Sequence[SpotFault]) -> str:
+    seen = sum(fault is SpotFault.OUTLIER for fault in faults)
     if seen == 0:
         return (
             f"no spot in the last {pulses} pulses: the laser off, the beam or the camera's view blocked, or the camera "

@@ -13,6 +13,7 @@ from gripmon.laser.beliefs import MotionTest, Places, Pulse
 from gripmon.laser.judgement import (
     UNIT,
     Moved,
+    SpotFault,
     SpotJudgement,
     SpotSeen,
     SpotWatchSettings,
@@ -24,7 +25,7 @@ from gripmon.laser.judgement import (
 from gripmon.laser.setup import LaserCalibration
 from gripmon.laser.spots import Spot
 from gripmon.laser.world import Prediction, Single, alone, calibrated, larger, predict, visible
-from gripmon.model.records import Alert, PulseFault, State, Verdict
+from gripmon.model.records import Alert, State, Verdict
 
 MOTION, VIEW = "motion", "view"
 """Topics of the alerts."""
@@ -62,7 +63,7 @@ class SpotWatch:
         self._test.reset()
         self._places = Places()
         self.state, self.verdict = State.ACQUIRING, Verdict.UNKNOWN
-        self._bad: list[PulseFault] = []
+        self._bad: list[SpotFault] = []
         self._good = 0
         self._odds = 0.0
         self._moved: Moved | None = None
@@ -73,11 +74,11 @@ class SpotWatch:
         self.pulses += 1
         self._stamp_ns = max(self._stamp_ns, seen.stamp_ns)
         if not np.isfinite(seen.base_T_ee).all():
-            return self._judged(seen, PulseFault.NOT_FINITE, "the arm's pose is not finite")
+            return self._judged(seen, SpotFault.NOT_FINITE, "the arm's pose is not finite")
         predicted = predict(self._calibrated.world, self._calibrated.camera, seen.base_T_ee)
         why_not = visible(self._calibrated, predicted, self._arm)
         if why_not is not None:
-            return self._judged(seen, PulseFault.NOT_FORESEEN, why_not)
+            return self._judged(seen, SpotFault.NOT_FORESEEN, why_not)
         if isinstance(seen.candidates, NotFound):
             return self._missing(seen, predicted, seen.candidates.reason)
         spots = [
@@ -108,7 +109,7 @@ class SpotWatch:
         if found.believed:
             return self._judged(seen, None, "", predicted, single)
         reason = outlier_text(single.off_px, single.square)
-        return self._judged(seen, PulseFault.OUTLIER, reason, predicted, single)
+        return self._judged(seen, SpotFault.OUTLIER, reason, predicted, single)
 
     def _missing(self, seen: SpotSeen, predicted: Prediction, reason: str) -> SpotJudgement:
         """No spot was found: that counts as a fault only where one should be visible."""
@@ -118,20 +119,20 @@ class SpotWatch:
         if (predicted.uv_px < margin).any() or (predicted.uv_px > size - 1.0 - margin).any():
             u, v = predicted.uv_px
             where = f"the spot should be at ({u:.0f}, {v:.0f}) px, not safely within the image, and was not seen"
-            return self._judged(seen, PulseFault.NOT_FORESEEN, where, predicted)
-        return self._judged(seen, PulseFault.NO_SPOT, reason, predicted)
+            return self._judged(seen, SpotFault.NOT_FORESEEN, where, predicted)
+        return self._judged(seen, SpotFault.NO_SPOT, reason, predicted)
 
     def _judged(
         self,
         seen: SpotSeen,
-        fault: PulseFault | None,
+        fault: SpotFault | None,
         reason: str,
         predicted: Prediction | None = None,
         single: Single | None = None,
     ) -> SpotJudgement:
         if fault is None:
             self._bad, self._good = [], self._good + 1
-        elif fault in (PulseFault.NO_SPOT, PulseFault.OUTLIER):
+        elif fault in (SpotFault.NO_SPOT, SpotFault.OUTLIER):
             self._bad, self._good = [*self._bad, fault][-1000:], 0
         self.state, self.verdict = self._state(), Verdict.UNKNOWN
         self.verdict = self._verdict()
@@ -153,7 +154,7 @@ class SpotWatch:
 
     def _state(self) -> State:
         # Wrong spots may be the start of a motion, which the motion test explains better: they count half.
-        astray = sum(fault is PulseFault.OUTLIER for fault in self._bad)
+        astray = sum(fault is SpotFault.OUTLIER for fault in self._bad)
         if len(self._bad) - 0.5 * astray >= self.settings.pulses_until_lost:
             return State.LOST
         if self._test.moved:

@@ -21,7 +21,7 @@ from gripmon.laser.setup import NAMES, LaserCalibration, LaserSetup, basis, orig
 from gripmon.laser.spots import Spot
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record, left_jacobians, perturb, skew
-from gripmon.model.records import Array, SpotGap
+from gripmon.model.records import Array
 
 PARAMETERS = (
     "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",
@@ -213,6 +213,21 @@ def triangulate(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) ->
     return Triangulation(
         np.stack([first, second, third]), np.stack([first_slopes, second_slopes, third_slopes]), gap, gap_slopes
     )
+
+
+class SpotGap(NamedTuple):
+    """Two of the three ways to compute a spot, and how far apart they put it.
+
+    ``gap_m``: from the first way's result to the second's, base frame; ``sigma_m``: standard deviation of the distance,
+    along the gap; ``square``: normalised square of the gap (chi-square with ``freedom``): about that while nothing has
+    moved.
+    """
+
+    ways: tuple[str, str]
+    gap_m: tuple[float, float, float]
+    sigma_m: float
+    square: float
+    freedom: int
 
 
 def disagreements(found: Triangulation, covariance: Array) -> tuple[SpotGap, ...]:

@@ -16,13 +16,11 @@ from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertRecord,
-    ArmPose,
     FrameRecord,
     Limits,
     Meta,
     RecordedCommand,
     Severity,
-    SpotRecord,
     State,
     StateRecord,
     Transform,
@@ -103,17 +101,6 @@ class Row:
     limits: Limits | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class SpotRow:
-    """One pulse of a second camera's laser."""
-
-    record: SpotRecord
-    picture: Picture | None
-
-
-AnyRow = Row | SpotRow
-
-
 class Sender:
     """Sends columns with both timelines."""
 
@@ -132,15 +119,15 @@ class Sender:
             indexes.insert(0, rr.TimeColumn("capture_time", timestamp=times))
         self.stream.send_columns(path, indexes, columns)
 
-    def frames(self, path: str, rows: Sequence[AnyRow], columns: rr.ComponentColumnList) -> None:
+    def frames(self, path: str, rows: Sequence[Row], columns: rr.ComponentColumnList) -> None:
         self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)
 
-    def scalars(self, path: str, rows: Sequence[AnyRow], values: Sequence[Sequence[float]]) -> None:
+    def scalars(self, path: str, rows: Sequence[Row], values: Sequence[Sequence[float]]) -> None:
         """Several curves; a row without values leaves a gap in them."""
         flat = np.array([v for some in values for v in some], dtype=np.float64)
         self.frames(path, rows, rr.Scalars.columns(scalars=flat).partition([len(some) for some in values]))
 
-    def curve(self, path: str, rows: Sequence[AnyRow], values: Sequence[float | None]) -> None:
+    def curve(self, path: str, rows: Sequence[Row], values: Sequence[float | None]) -> None:
         """One curve; None leaves a gap in it."""
         self.scalars(path, rows, [() if value is None else (value,) for value in values])
 
@@ -149,7 +136,7 @@ class Sender:
         count = 1 if isinstance(names, str) else len(names)
         self.static(path, rr.SeriesLines(names=names, colors=colours, widths=[width] * count))
 
-    def images(self, path: str, rows: Sequence[AnyRow]) -> None:
+    def images(self, path: str, rows: Sequence[Row]) -> None:
         """The pictures of rows that have one."""
         pictures = [row.picture for row in rows if row.picture is not None]
         if pictures:
@@ -185,7 +172,7 @@ class EventWriter:
         """Write state and verdict again with the next frame, changed or not."""
         self._state = self._verdict = ""
 
-    def write(self, rows: Sequence[AnyRow], events: Events, more: Sequence[Line] = ()) -> None:
+    def write(self, rows: Sequence[Row], events: Events, more: Sequence[Line] = ()) -> None:
         """``more``: further lines for the log."""
         if rows:
             self._newest_stamp_ns = rows[-1].record.stamp_ns
@@ -220,7 +207,7 @@ class EventWriter:
         whole = rr.AnyValues.columns(json=[to_json(message).decode() for message in messages])
         self._send.columns(path, stamps_ns, [message.seq for message in messages], whole)
 
-    def _status(self, rows: Sequence[AnyRow]) -> list[Line]:
+    def _status(self, rows: Sequence[Row]) -> list[Line]:
         """Write state and verdict where they change; returns the changes and alerts as log lines."""
         lines = []
         for record in (row.record for row in rows):
@@ -269,13 +256,12 @@ class Writer:
             recording_id=scene.recording_id,
             robot=scene.robot,
             camera=scene.camera,
-            gripper="" if scene.gripper is None else scene.gripper.name,
+            gripper=scene.gripper.name,
             version=scene.version,
             file_number=file_number,
             started_ns=time.time_ns(),
             image_policy=_image_policy(scene.settings),
             has_truth=scene.has_truth,
-            kind="frames" if scene.laser is None else "spots",
         )
         self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
         if scene.configuration is not None:
@@ -298,7 +284,7 @@ class Writer:
     def finish(self) -> None:
         """Called when nothing more is written to this file."""
 
-    def _write_records(self, rows: Sequence[AnyRow]) -> None:
+    def _write_records(self, rows: Sequence[Row]) -> None:
         self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
 
 
@@ -312,7 +298,7 @@ def _image_policy(settings: RecordingSettings) -> str:
     return f"{kind}, {rate}{every}, one at every alert and change{around}"
 
 
-def pose_columns(poses: Sequence[Transform | ArmPose]) -> rr.ComponentColumnList:
+def pose_columns(poses: Sequence[Transform]) -> rr.ComponentColumnList:
     return rr.Transform3D.columns(
         translation=[pose.translation_m for pose in poses], quaternion=[pose.rotation_xyzw for pose in poses]
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 import rerun as rr
 
 from gripmon.model.errors import one_line
-from gripmon.record.columns import APPLICATION_ID, AnyRow, Writer
+from gripmon.record.columns import APPLICATION_ID, Row, Writer
 from gripmon.record.container import free_closed_streams, is_complete
 from gripmon.record.keeping import (
     PIN_SUFFIX,
@@ -33,7 +33,6 @@ from gripmon.record.keeping import (
 from gripmon.record.recorder import Events, Scene
 from gripmon.record.rows import RowWriter
 from gripmon.record.scene import layout_file
-from gripmon.record.spots import SpotWriter
 
 _FIRST_RETRY_S = 1.0
 _LONGEST_RETRY_S = 30.0
@@ -50,8 +49,7 @@ _RESUME_FREE_FACTOR = 1.02
 
 def make_writer(stream: rr.RecordingStream, scene: Scene, file_number: int) -> Writer:
     """The writer for this scene, which has written the static data."""
-    kind = RowWriter if scene.laser is None else SpotWriter
-    return kind(stream, scene, file_number)
+    return RowWriter(stream, scene, file_number)
 
 
 @dataclass
@@ -66,7 +64,7 @@ class _File:
     frames: int = 0
     whole_bytes: int = 0
 
-    def cover(self, rows: Sequence[AnyRow]) -> None:
+    def cover(self, rows: Sequence[Row]) -> None:
         stamps_ns = [row.record.stamp_ns for row in rows]
         known_ns = [stamp_ns for stamp_ns in (self.first_ns, self.last_ns) if stamp_ns is not None]
         if stamps_ns:
@@ -102,8 +100,8 @@ class FileSeries:
         self._file: _File | None = None
         self._stream: rr.RecordingStream | None = None
         self._writer: Writer | None = None
-        self._rows: list[AnyRow] = []
-        self._late: list[AnyRow] = []
+        self._rows: list[Row] = []
+        self._late: list[Row] = []
         self._events = Events()
         self._newest_reference = scene.reference
         self._unflushed = 0
@@ -132,10 +130,10 @@ class FileSeries:
     def frames_waiting(self) -> int:
         return len(self._rows)
 
-    def add_frames(self, rows: Sequence[AnyRow]) -> None:
+    def add_frames(self, rows: Sequence[Row]) -> None:
         self._rows += rows
 
-    def add_pictures(self, rows: Sequence[AnyRow]) -> None:
+    def add_pictures(self, rows: Sequence[Row]) -> None:
         """Pictures of frames that were added before without them."""
         self._late += rows
 

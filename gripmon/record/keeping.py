@@ -20,7 +20,7 @@ from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cau
 from gripmon.record.container import is_complete, whole_bytes
 
 if TYPE_CHECKING:
-    from gripmon.record.columns import AnyRow
+    from gripmon.record.columns import Row
 
 PIN_SUFFIX = ".pinned"
 _MOMENTS_KEPT = 64
@@ -75,13 +75,13 @@ class PictureRing:
 
     def __init__(self, span_ns: int, limit_bytes: int) -> None:
         self._span_ns, self._limit_bytes = span_ns, limit_bytes
-        self._rows: deque[AnyRow] = deque()
+        self._rows: deque[Row] = deque()
         self.bytes = 0
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def push(self, row: AnyRow) -> None:
+    def push(self, row: Row) -> None:
         rows, stamp_ns = self._rows, row.record.stamp_ns
         if rows and stamp_ns < rows[-1].record.stamp_ns:
             rows.clear()  # the clock was set back: the age of the others is unknown
@@ -91,10 +91,10 @@ class PictureRing:
         while rows and (self.bytes > self._limit_bytes or stamp_ns - rows[0].record.stamp_ns > self._span_ns):
             self.bytes -= _size(rows.popleft())
 
-    def take(self, moments: Moments) -> list[AnyRow]:
+    def take(self, moments: Moments) -> list[Row]:
         """Remove and return the rows near the moments, in order."""
-        taken: list[AnyRow] = []
-        rest: deque[AnyRow] = deque()
+        taken: list[Row] = []
+        rest: deque[Row] = deque()
         for row in self._rows:
             (taken if moments.near(row.record.stamp_ns) else rest).append(row)
         self._rows = rest
@@ -102,7 +102,7 @@ class PictureRing:
         return taken
 
 
-def _size(row: AnyRow) -> int:
+def _size(row: Row) -> int:
     return 0 if row.picture is None else len(row.picture.blob)
 
 

@@ -175,7 +175,7 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
         return []
     ours = [contents for contents in found if contents.is_ours and not contents.is_of_spots]
     if not ours and any(contents.is_of_spots for contents in found):
-        faults.append(f"{path}: holds a second camera's laser spots, no frames; gripmon view shows them; not used")
+        faults.append(f"{path}: holds laser spots of an earlier version, no frames; gripmon view shows them; not used")
     elif not ours:
         applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
         what = f"is a recording of the application {applications} that holds no frames of a monitor's"

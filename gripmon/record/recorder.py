@@ -17,21 +17,18 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import (
     AlertRecord,
     Frame,
     FrameRecord,
-    Image,
     Limits,
     MeasurementTrace,
     MonitorNotes,
     RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
-    SpotRecord,
     StateRecord,
 )
 
@@ -150,10 +147,9 @@ class Recorder:
     """The interface of a recording to the loops: it never blocks, and counts what it has to drop.  This base class
     records nothing.
 
-    A wrist camera's loop offers frames and references, a second camera's offers spots.  ``dropped`` counts frames that
-    are not in the recording, ``images_dropped`` images missing from recorded frames; ``failure`` says why nothing is
-    being written, None while all is well.  ``has_room``: nothing would be dropped now, or waiting would not help; a
-    source that can wait does so until then.
+    ``dropped`` counts frames that are not in the recording, ``images_dropped`` images missing from recorded frames;
+    ``failure`` says why nothing is being written, None while all is well.  ``has_room``: nothing would be dropped now,
+    or waiting would not help; a source that can wait does so until then.
     """
 
     @property
@@ -174,9 +170,6 @@ class Recorder:
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Record a frame.  Before this returns, ``notes`` is called, and ``trace`` if the picture is recorded."""
-
-    def spot(self, record: SpotRecord, image: Image | None) -> None:
-        """Record a pulse's result, with the image in which its spot was searched."""
 
     def happened(self, events: Events) -> None:
         """Record events that belong to no frame."""
@@ -201,10 +194,7 @@ class Recorder:
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
-    """The first message: everything that doesn't change while a recording runs.
-
-    A wrist camera has a gripper and a reference, a second camera a ``laser``.
-    """
+    """The first message: everything that doesn't change while a recording runs."""
 
     name: str
     recording_id: str
@@ -213,9 +203,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     camera: str
     lens: LensSettings
-    gripper: GripperModel | None = None
-    reference: ReferenceRecord | None = None
-    laser: LaserCalibration | None = None
+    gripper: GripperModel
+    reference: ReferenceRecord
     has_truth: bool = False
     version: str = __version__
     configuration: RecordedConfiguration | None = None
@@ -223,8 +212,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def tcp_m(self) -> NDArray[np.float64]:
-        """The TCP at the reference of a wrist camera, in the camera frame."""
-        assert self.reference is not None, "a wrist camera's"
+        """The TCP at the reference, in the camera frame."""
         return np.array(self.reference.cam_T_grip.translation_m)
 
 
@@ -234,22 +222,18 @@ def make_scene(
     name: str,
     robot: str,
     camera_name: str,
-    camera: Camera | None,
-    gripper: Gripper | None,
-    reference: ReferenceRecord | None,
+    camera: Camera,
+    gripper: Gripper,
+    reference: ReferenceRecord,
     has_truth: bool = False,
     configuration: RecordedConfiguration | None = None,
     view: ViewSettings | None = None,
-    laser: LaserCalibration | None = None,
 ) -> Scene:
-    """The scene of a wrist camera, or of a second camera if only ``laser`` is given."""
-    seen_by = camera if laser is None else laser
-    assert seen_by is not None, "a wrist camera, or a second camera's laser"
-    lens = seen_by.settings if isinstance(seen_by, Camera) else seen_by.camera
+    """The scene, with an id of its own."""
     return Scene(
         name=name, recording_id=f"{name}-{uuid.uuid4()}", directory=directory, settings=settings, robot=robot,
-        camera=camera_name, lens=lens, gripper=None if gripper is None else gripper.model, reference=reference,
-        laser=laser, has_truth=has_truth, configuration=configuration, view=view,
+        camera=camera_name, lens=camera.settings, gripper=gripper.model, reference=reference, has_truth=has_truth,
+        configuration=configuration, view=view,
     )  # fmt: skip
 
 
@@ -277,7 +261,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     :class:`gripmon.model.records.MonitorNotes`.
     """
 
-    record: FrameRecord | SpotRecord
+    record: FrameRecord
     image: ImageNote | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None

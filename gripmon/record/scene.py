@@ -27,7 +27,6 @@ from gripmon.record.columns import (
     two_columns,
 )
 from gripmon.record.recorder import Scene, TraceNote, pairs
-from gripmon.record.spots import spot_blueprint
 
 IMAGE = "rig/camera/image"
 _POINT_PX, _CORNER_PX, _LINE_PX = 1.6, 3.5, 0.6
@@ -312,13 +311,8 @@ def layout_file(scene: Scene) -> bytes:
 
 
 def make_blueprint(scene: Scene) -> rrb.Blueprint:
-    """The default layout for a recording of either kind of camera."""
-    return _wrist_blueprint(scene) if scene.laser is None else spot_blueprint(scene)
-
-
-def _wrist_blueprint(scene: Scene) -> rrb.Blueprint:
-    """Left: the image with its overlay, and the events.  Right: the rig in space, the TCP's drift with its limits, the
-    drift test's statistic over its threshold, and the resulting states.
+    """The default layout.  Left: the image with its overlay, and the events.  Right: the rig in space, the TCP's drift
+    with its limits, the drift test's statistic over its threshold, and the resulting states.
     """
     truth = ["drift/truth_mm"] if scene.has_truth else []
     truth_named = "; wide, pale: truth" if scene.has_truth else ""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from gripmon.model.errors import in_short, one_line
 from gripmon.model.priority import give_way
-from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
-from gripmon.record.columns import APPLICATION_ID, AnyRow, Picture, Row, SpotRow, Writer
+from gripmon.model.records import Alert, AlertRecord, Limits
+from gripmon.record.columns import APPLICATION_ID, Picture, Row, Writer
 from gripmon.record.files import FileSeries, make_writer
 from gripmon.record.keeping import Moments, PictureRing, Trigger, pinned_by
 from gripmon.record.process import ImageRing, Unframer
@@ -162,13 +162,10 @@ class RecordingLoop:
             self._images_done += 1
             self._report()  # its slot is free
         self._limits = note.limits or self._limits
-        row: AnyRow
-        if isinstance(record, FrameRecord):
-            row = Row(
-                record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
-            )
-        else:
-            row = SpotRow(record, picture)
+        row: Row
+        row = Row(
+            record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
+        )
         if note.lost and not note.due:
             self._without.append(record.stamp_ns)
             self._count_lost()
@@ -229,10 +226,10 @@ class NoFiles:
     def __init__(self) -> None:
         self.frames_written = 0
 
-    def add_frames(self, rows: Sequence[AnyRow]) -> None:
+    def add_frames(self, rows: Sequence[Row]) -> None:
         self.frames_written += len(rows)
 
-    def add_pictures(self, rows: Sequence[AnyRow]) -> None: ...
+    def add_pictures(self, rows: Sequence[Row]) -> None: ...
     def add_events(self, events: Events) -> None: ...
     def pin(self, *_alert: object) -> None: ...
     def write(self) -> None: ...
@@ -250,8 +247,8 @@ class LiveStream:
     def __init__(self, scene: Scene, settings: ViewSettings):
         self._scene, self._settings = scene, settings
         self._lock = threading.Condition()  # guards what follows
-        self._rows: list[AnyRow] = []
-        self._late: list[AnyRow] = []
+        self._rows: list[Row] = []
+        self._late: list[Row] = []
         self._events = Events.at_first(scene.reference)
         self._due = self._ending = False
         # Of the thread alone.
@@ -264,11 +261,11 @@ class LiveStream:
         self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
         self._thread.start()
 
-    def add_frames(self, rows: Sequence[AnyRow]) -> None:
+    def add_frames(self, rows: Sequence[Row]) -> None:
         with self._lock:
             self._rows = self._bounded([*self._rows, *rows])
 
-    def add_pictures(self, rows: Sequence[AnyRow]) -> None:
+    def add_pictures(self, rows: Sequence[Row]) -> None:
         """Pictures of frames that were added before without them."""
         with self._lock:
             self._late = self._bounded([*self._late, *rows])
@@ -290,7 +287,7 @@ class LiveStream:
             self._lock.notify()
         self._thread.join(_CLOSE_S)
 
-    def _bounded(self, rows: list[AnyRow]) -> list[AnyRow]:
+    def _bounded(self, rows: list[Row]) -> list[Row]:
         """The newest rows, as many as the limits allow."""
         left_bytes, kept = _WAITING_MEMORY_FRACTION * self._settings.memory_limit_bytes, 0
         for row in reversed(rows[-_ROWS_WAITING:]):
@@ -315,7 +312,7 @@ class LiveStream:
             self._stream.disconnect()
         self._stream = self._writer = None
 
-    def _send(self, rows: list[AnyRow], late: list[AnyRow], events: Events) -> None:
+    def _send(self, rows: list[Row], late: list[Row], events: Events) -> None:
         """Start or restart the stream if due, and send; a server that a viewer blocks gets nothing more."""
         now_s = time.monotonic()
         if self._writer is None and now_s < self._retry_at:

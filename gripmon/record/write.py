@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
@@ -25,7 +24,6 @@ from gripmon.model.records import (
     MonitorNotes,
     RecordedConfiguration,
     ReferenceRecord,
-    SpotRecord,
     State,
     Verdict,
 )
@@ -64,7 +62,7 @@ class _Waiting(NamedTuple):
     only around an alert; ``lost``: there was no room for its image.
     """
 
-    record: FrameRecord | SpotRecord
+    record: FrameRecord
     counted: bool
     image: Image | None
     trace: MeasurementTrace | None
@@ -155,11 +153,7 @@ class ProcessRecorder(Recorder):
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def spot(self, record: SpotRecord, image: Image | None) -> None:
-        """Record a pulse of a second camera's laser, from the loop's thread."""
-        self.offer(Frame(record.seq, record.stamp_ns, image), record, lambda: None)
-
-    def offer(self, frame: Frame, record: FrameRecord | SpotRecord, trace: Trace, notes: Notes | None = None) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as configured, and at events."""
         if self._patience_s > 0.0:
             self._wait_for_room()
@@ -359,10 +353,9 @@ def open_recorder(
     *,
     robot: str,
     camera_name: str,
-    camera: Camera | None = None,
-    gripper: Gripper | None = None,
-    reference: ReferenceRecord | None = None,
-    laser: LaserCalibration | None = None,
+    camera: Camera,
+    gripper: Gripper,
+    reference: ReferenceRecord,
     directory: Path | None = None,
     name: str | None = None,
     truth_tcp_m: Truth | None = None,
@@ -372,8 +365,7 @@ def open_recorder(
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and so on, and are never overwritten.
 
-    A wrist camera has a ``camera``, a ``gripper`` and a ``reference``; a second camera has a ``laser``, and all its
-    images are recorded.  ``directory`` replaces that of the settings, ``name`` the default, made of robot, camera and
+    ``directory`` replaces that of the settings, ``name`` the default, made of robot, camera and
     time of day.  ``truth_tcp_m``, from a simulator, maps a frame's ``seq`` to the TCP's true position in the camera
     frame, whose shift from the reference is drawn beside the estimate; it is called in another thread than the loop's.
     ``patience_s``: how long ``offer`` may wait for room before it drops a frame, for input that can wait, such as a
@@ -387,10 +379,8 @@ def open_recorder(
         where.mkdir(parents=True, exist_ok=True)
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
-    if laser is not None:
-        settings = msgspec.structs.replace(settings, image_every=1)
     scene = make_scene(
         settings, str(where.resolve()), name, robot, camera_name, camera, gripper, reference, truth_tcp_m is not None,
-        configuration, view, laser,
+        configuration, view,
     )  # fmt: skip
     return ProcessRecorder(scene, truth_tcp_m, patience_s)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import inspect as mi
 
-from gripmon.daemon.config.settings import SecondSettings, Settings
+from gripmon.daemon.config.settings import Settings
 
 UNITS = {
     "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s",
@@ -25,13 +25,6 @@ _HEAD = """\
 A configuration is one YAML file. `gripmon check FILE` validates it and says of each mistake the file, the key, what is
 wrong and what would be right. The files in `configs/` are complete examples with a comment at each key. A key without a
 default has to be given; a key that is not listed here is refused. Paths are relative to the file.
-"""
-_SECOND = """\
-## A second camera
-
-A configuration with the section `laser` watches a second camera by laser pointer
-([how to](../howto/laser.md#watching)).
-It has `robot`, `camera_name`, `source`, `publish`, `recording`, `view`, `metrics` and `daemon` as above, and:
 """
 
 
@@ -50,10 +43,6 @@ def page() -> str:
     """The page in Markdown."""
     parts = [_HEAD]
     for title, about, keys in _sections(mi.type_info(Settings), "", ""):
-        parts.append(_section(title, about, keys))
-    parts.append(_SECOND)
-    laser = next(field for field in mi.type_info(SecondSettings).fields if field.encode_name == "laser")
-    for title, about, keys in _sections(laser.type, "laser", ""):
         parts.append(_section(title, about, keys))
     return "\n".join(parts)
 

@@ -26,7 +26,6 @@ from gripmon.daemon.config.checks import (
     view_fault,
 )
 from gripmon.daemon.config.earlier import without_gone
-from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_pulses, load_second
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
@@ -47,15 +46,11 @@ if TYPE_CHECKING:
 __all__ = [
     "Config",
     "ConfigError",
-    "SecondConfig",
     "Settings",
     "builtin_config",
     "check_network",
-    "is_second",
     "load_config",
-    "load_pulses",
     "load_scenario",
-    "load_second",
     "read_gripper",
 ]
 
@@ -154,9 +149,9 @@ def load_config(
     """
     path = Path(path)
     values = read_configuration(path)
-    if SECTION in values:
-        right = "a wrist camera's configuration; gripmon run, check and replay take both"
-        raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
+    if "laser" in values and "gripper" not in values:
+        right = "gripmon check --laser LASER.yaml SPOTS.csv compares fresh spots with a calibration"
+        raise ConfigError(path, "laser", "a second camera isn't watched by the daemon any more", right)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
     camera = _camera(path, settings, calibrated)
@@ -192,7 +187,7 @@ def _within(values: object, *keys: str) -> dict[str, object]:
     return values if isinstance(values, dict) else {}
 
 
-def check_network(config: Config | SecondConfig) -> Joining | None:
+def check_network(config: Config) -> Joining | None:
     """How the network would be joined; None if nothing is published.
 
     Checks what matters only for joining it: Zenoh configuration files, endpoints, packages for ROS 2.  Raises

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, SecondSettings, Settings
+from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
 from gripmon.io.ros2.names import RosNameError, network_of, subscription_key
@@ -348,18 +348,18 @@ def _joint_fault(jaw: JawSettings) -> Fault | None:
     return None
 
 
-def joined(settings: Settings | SecondSettings, camera: Camera, directory: Path) -> Joining | None:
+def joined(settings: Settings, camera: Camera, directory: Path) -> Joining | None:
     """How the network would be joined; None if it won't be.  :class:`SettingsError` if it can't be."""
     if (missing := package_fault(settings.metrics)) is not None:
         raise SettingsError(Fault(*missing))
     if not settings.publish.enabled:
         return None
-    wrist, source, key = settings if isinstance(settings, Settings) else None, settings.source, ""
+    source, key = settings.source, ""
     try:
-        found = joining(settings.publish if wrist is None else network_of(wrist.publish, wrist.ros2), directory)
-        if wrist is not None and wrist.jaw.source == "ros2_joint_state":
+        found = joining(network_of(settings.publish, settings.ros2), directory)
+        if settings.jaw.source == "ros2_joint_state":
             key = "jaw.source: "
-        elif wrist is not None and wrist.ros2.enabled:
+        elif settings.ros2.enabled:
             key = "ros2.enabled: "
         if key:
             typestore()

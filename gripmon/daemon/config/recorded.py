@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from gripmon.daemon.config import Config, SecondConfig, load_config
+from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.typed import ConfigError
 from gripmon.model.records import MonitorState, RecordedConfiguration, RecordedFile
 from gripmon.model.yaml_text import as_yaml
@@ -41,16 +41,7 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
     return _recorded(config.path.name, files, values, start)
 
 
-def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
-    """The same for a second camera, with its laser calibration."""
-    values, name = _plain(config), config.calibration_path.name
-    name = name if name != config.path.name else f"laser-{name}"
-    values["laser"] = {key: value for key, value in values["laser"].items() if value is not None}
-    values["laser"] |= {"calibration": name, "pulses": "pulses-of-this-recording.csv"}
-    return _recorded(config.path.name, {name: _file(config.path, config.calibration_path)}, values)
-
-
-def _plain(config: Config | SecondConfig) -> dict[str, Any]:
+def _plain(config: Config) -> dict[str, Any]:
     """The sections on which decisions depend."""
     values: dict[str, Any] = msgspec.to_builtins(config.settings)
     kept = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}

@@ -14,8 +14,6 @@ from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources import SourceSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.judge.statefile import StateSettings
-from gripmon.laser.judgement import SpotWatchSettings
-from gripmon.laser.matching import PulseSettings
 from gripmon.model.camera import LensSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.record.recorder import RecordingSettings, ViewSettings
@@ -138,45 +136,3 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     metrics: MetricsSettings = MetricsSettings()
     daemon: DaemonSettings = DaemonSettings()
     state: StateSettings = StateSettings()
-
-
-class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The laser calibration that is watched, and how."""
-
-    calibration: Annotated[
-        str, Meta(min_length=1, description="file of gripmon calibrate laser, its path relative to this file")
-    ]
-    pulses: (
-        Annotated[
-            str,
-            Meta(
-                min_length=1,
-                description="table of the pulses (CSV), relative to this file, for a folder or a video; live "
-                "pulses come over the network",
-            ),
-        ]
-        | None
-    ) = None
-    no_spot_alert_after_s: (
-        Annotated[
-            float,
-            Meta(gt=0.0, description="time without a usable spot after which there is an alert; absent: never (s)"),
-        ]
-        | None
-    ) = None
-    frames: PulseSettings = PulseSettings()
-    watch: SpotWatchSettings = SpotWatchSettings()
-
-
-class SecondSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole configuration file of a second camera."""
-
-    robot: Name
-    camera_name: Name
-    laser: LaserSettings
-    source: SourceSettings
-    publish: PublishSettings = PublishSettings()
-    recording: RecordingSettings = RecordingSettings()
-    view: ViewSettings = ViewSettings()
-    metrics: MetricsSettings = MetricsSettings()
-    daemon: DaemonSettings = DaemonSettings()

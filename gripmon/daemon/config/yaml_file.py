@@ -65,7 +65,7 @@ _SCHEMAS = {
 }
 _NAMED_UNDER = {
     "a file of gripmon calibrate intrinsics": "camera", "a file of gripmon calibrate plane": "reference",
-    "a file of gripmon calibrate laser": "laser.calibration", "a gripper file": "gripper", "a taught model": "taught",
+    "a gripper file": "gripper", "a taught model": "taught",
 }  # fmt: skip
 """Keys of a configuration."""
 
@@ -80,7 +80,7 @@ def builtin_config(name: str) -> Path:
 
 
 def read_configuration(path: Path) -> dict[str, Any]:
-    """The mapping in a configuration of a wrist camera or a second camera.  :class:`ConfigError`, which names the type
+    """The mapping in a configuration.  :class:`ConfigError`, which names the type
     of any other gripmon file.
     """
     inside = path / "config.yaml"  # as gripmon teach and setup name it

@@ -7,8 +7,6 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 ``reference``  on every new revision; late joiners get the last one
 ``alert``      when there is one; an advanced subscriber with history gets the last 32
 ``alive``      liveliness token, vanishes with the process; ``alive/<id>`` another one, for this start of the process
-``spot``       of a second camera in place of ``transform`` and ``reference``: the result of each laser pulse
-``pulse``      read, not written: the pulses, from the robot's program
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
 ``cmd/<name>`` queryable: an operator's commands, see :mod:`gripmon.io.publish.commands`
 
@@ -16,23 +14,17 @@ Late joiners get the last one in two ways: by a plain ``get`` on the key (answer
 subscriber with history (``zenoh.ext``).
 """
 
-from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord
+from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 
 
 class Publisher:
-    """A loop's output; no method waits for the network.  This base class publishes nothing.
-
-    A wrist camera's loop has transforms and references, a second camera's has spots.
-    """
+    """A loop's output; no method waits for the network.  This base class publishes nothing."""
 
     def transform(self, record: FrameRecord) -> None:
         """One frame's record."""
 
     def reference(self, record: ReferenceRecord) -> None:
         """The reference that is in force from now on."""
-
-    def spot(self, record: SpotRecord) -> None:
-        """The result of a pulse."""
 
     def state(self, record: StateRecord) -> None:
         """The newest state."""

@@ -1,4 +1,4 @@
-"""The robot's reports on the network: its jaw opening, and laser pulses."""
+"""The robot's report on the network: its jaw opening."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import bisect
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,9 +15,8 @@ import zenoh
 from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state, opening_between
 from gripmon.io.wire import Link, in_zenohs_thread
 from gripmon.io.wire.link import Malformed
-from gripmon.laser.matching import ReportedPulse, of_message
 from gripmon.model.errors import in_short
-from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_json, largest_bytes
+from gripmon.model.records import JawReading, MessageRefused, from_json, largest_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -249,29 +247,3 @@ _decode_number = msgspec.json.Decoder(float).decode
 
 
 _WAITING_MOST = 64
-
-
-class ZenohPulses(_Input):
-    """Laser pulses in order of arrival.
-
-    Zenoh's thread stores what arrives; any thread may read.  A malformed or impossible pulse is counted and reported.
-    If more than 64 pulses wait to be read, the oldest are dropped.
-    """
-
-    def __init__(self, link: Link, key: str) -> None:
-        self._waiting: deque[ReportedPulse] = deque(maxlen=_WAITING_MOST)
-        super().__init__(link, key, "pulse message")
-
-    def poll(self) -> ReportedPulse | None:
-        """Return the next pulse without waiting; None if there is none."""
-        return self._waiting.popleft() if self._waiting else None
-
-    def fault(self) -> str:
-        """What is wrong with the pulses received, in a few words for a person; empty if nothing is."""
-        return self._malformed.fault()
-
-    def _take(self, payload: zenoh.ZBytes) -> bool:
-        if len(payload) > (most := largest_bytes(LaserPulse)):  # before a copy of it is made
-            raise MessageRefused(f"{len(payload)} bytes; at most {most}")
-        self._waiting.append(of_message(from_json(payload.to_bytes(), LaserPulse)))
-        return True

@@ -21,14 +21,13 @@ from gripmon.model.records import (
     ClockReading,
     FrameRecord,
     ReferenceRecord,
-    SpotRecord,
     StateRecord,
     to_json,
 )
 
 _log = logging.getLogger(__name__)
 
-_T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
+_T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
 _HEARTBEAT_S = 1.0
@@ -123,20 +122,6 @@ class ZenohPublisher(_ZenohStates):
     def _declared(self, wire: _Wire) -> None:
         wire.declare_newest("transform")
         wire.declare_kept("reference")
-
-
-class ZenohSpotPublisher(_ZenohStates):
-    """Publishes a second camera's records over a link, which it closes in the end.
-
-    While the link is not open yet, the last state and the last few spots and alerts are kept for its opening.
-    """
-
-    def spot(self, record: SpotRecord) -> None:
-        """Send the result of a pulse, and keep the last one for late joiners."""
-        self._put_each("spot", to_json(self._signed(record)))
-
-    def _declared(self, wire: _Wire) -> None:
-        wire.declare_kept("spot", _ALERTS_KEPT)
 
 
 def _keeping_publisher(
@@ -270,9 +255,6 @@ class Publishers(Publisher):
 
     def reference(self, record: ReferenceRecord) -> None:
         self._hand("reference", record)
-
-    def spot(self, record: SpotRecord) -> None:
-        self._hand("spot", record)
 
     def state(self, record: StateRecord) -> None:
         self._hand("state", record)

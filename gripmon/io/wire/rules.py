@@ -66,7 +66,7 @@ def with_robot(text: str, robot: str) -> str:
 
 def _parts(robot: str, monitor: str, driver: str) -> dict[str, str]:
     everything = f'["gripmon/{robot}/**", "gripmon/{robot}/*/*/@adv/**"]'
-    inputs = ", ".join(f'"gripmon/{robot}/*/{leaf}"' for leaf in ("jaw", "pulse", "image"))
+    inputs = ", ".join(f'"gripmon/{robot}/*/{leaf}"' for leaf in ("jaw", "image"))
     rules = f"""\
       {{ id: "{monitor} says", permission: "allow", flows: ["ingress"],
         messages: ["put", "declare_queryable", "reply", "liveliness_token", "declare_subscriber", "liveliness_query",

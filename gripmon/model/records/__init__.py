@@ -40,7 +40,6 @@ from gripmon.model.records.frames import (
     withheld,
 )
 from gripmon.model.records.json_schema import json_schema, summary
-from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.model.records.notes import Limits, MonitorNotes
@@ -77,10 +76,8 @@ __all__ = [
     "AlertEvent",
     "AlertKind",
     "AlertRecord",
-    "ArmPose",
     "Array",
     "AtReferenceRecord",
-    "CameraShift",
     "Cause",
     "CauseWeight",
     "ClockReading",
@@ -102,7 +99,6 @@ __all__ = [
     "FrameRecord",
     "Image",
     "JawReading",
-    "LaserPulse",
     "Limits",
     "MeasurementTrace",
     "MessageRefused",
@@ -114,7 +110,6 @@ __all__ = [
     "Origin",
     "Outlines",
     "Protection",
-    "PulseFault",
     "RecordedCommand",
     "RecordedConfiguration",
     "RecordedFile",
@@ -127,8 +122,6 @@ __all__ = [
     "Smoothed",
     "Snapshot",
     "SnapshotImage",
-    "SpotGap",
-    "SpotRecord",
     "StandingAlert",
     "State",
     "StateRecord",

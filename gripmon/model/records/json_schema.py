@@ -9,13 +9,12 @@ from typing import Any
 import msgspec
 
 from gripmon.model.records.commands import CommandRequest
-from gripmon.model.records.laser import LaserPulse
 from gripmon.model.records.messages import FrameNote, JawReading
 from gripmon.model.records.schemas import MESSAGES
 from gripmon.model.records.values import OpenEnum
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_FROM_OTHERS = (JawReading, FrameNote, LaserPulse, CommandRequest)
+_FROM_OTHERS = (JawReading, FrameNote, CommandRequest)
 _SCHEMA_TEXT = "name and major version of this schema"
 _LATER_TEXT = "; later versions may have more names"
 

@@ -14,7 +14,6 @@ import msgspec
 from gripmon.model.decoding import decoder_of
 from gripmon.model.records.commands import CommandError, CommandReply, CommandReply1, CommandRequest
 from gripmon.model.records.frames import FrameRecord, FrameRecord1
-from gripmon.model.records.laser import LaserPulse, SpotRecord
 from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
 from gripmon.model.records.references import ReferenceRecord
 
@@ -28,8 +27,6 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "clock": ClockReading,
     "jaw": JawReading,
     "frame": FrameNote,
-    "pulse": LaserPulse,
-    "spot": SpotRecord,
     "command": CommandRequest,
     "reply": CommandReply,
     "error": CommandError,
@@ -46,7 +43,6 @@ LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     ClockReading: 4096,
     JawReading: 4096,
     FrameNote: 4096,
-    LaserPulse: 4096,
     CommandRequest: 4096,
     CommandReply: 64 << 20,
 }

@@ -1,0 +1,72 @@
+"""A laser calibration as a 3D scene of rerun."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import rerun as rr
+
+from gripmon.laser.setup import LaserSetup, laser_lines, spots_on_plane
+from gripmon.model.camera import LensSettings
+from gripmon.model.geometry import invert
+from gripmon.model.records import Array
+from gripmon.record.columns import Colour, Sender, pinhole
+
+if TYPE_CHECKING:
+    from gripmon.laser.refinement import Refined
+
+IMAGE = "base/camera/image"
+_USED, _LEFT_OUT, _BEAM, _PLANE = (40, 120, 230, 255), (230, 60, 60, 255), (235, 90, 90, 255), (90, 180, 120, 90)
+_AXIS_M = 0.1
+_PLANE_MARGIN, _PLANE_LEAST_M = 1.3, 0.01  # half a side: this much more than the spots need, and at least
+
+
+def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
+    """Write a calibration: everything in the base frame, residuals in the camera's image.  Raises OSError."""
+    path.open("wb").close()
+    recording = rr.RecordingStream("gripmon_laser")
+    recording.save(path)
+    setup, log = refined.setup, Sender(recording).static
+    turn, centre = _log_camera(Sender(recording), setup, refined.camera)
+    spots = spots_on_plane(setup, base_T_ee)[0] @ turn.T + centre
+    origins = laser_lines(setup, base_T_ee)[0] @ turn.T + centre
+    seen = np.isfinite(spots).all(axis=1)
+    colours = [_USED if used else _LEFT_OUT for used in refined.used]
+    log("base", rr.Transform3D(translation=[0.0, 0.0, 0.0]))
+    log("base/axes", rr.Arrows3D(vectors=_AXIS_M * np.eye(3), colors=[(220, 40, 40), (60, 160, 60), (40, 90, 220)]))
+    shown = [colours[k] for k in np.flatnonzero(seen)]
+    log("base/spots", rr.Points3D(spots[seen], colors=shown, radii=0.002))
+    log("base/beams", rr.LineStrips3D(np.stack([origins[seen], spots[seen]], axis=1), colors=_BEAM, radii=0.0005))
+    normal = turn @ setup.normal_cam
+    middle = np.median(spots[seen], axis=0)
+    side = max(_PLANE_MARGIN * float(np.linalg.norm(spots[seen] - middle, axis=1).max()), _PLANE_LEAST_M)
+    log("base/plane", _plane(_plane_corners(normal, middle, side), _PLANE))
+    log("base/camera/image/spots", rr.Points2D(uv_px, colors=colours, radii=2.0))
+    lines = np.stack([uv_px, uv_px - refined.residuals_px], axis=1)[seen]
+    log("base/camera/image/residuals", rr.LineStrips2D(lines, colors=_LEFT_OUT))
+    recording.flush()
+    recording.disconnect()
+
+
+def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> tuple[Array, Array]:
+    """Log the camera and its image; returns its rotation (3, 3) and position (3,) in the base frame."""
+    base_T_cam = invert(setup.cam_T_base)
+    turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
+    send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
+    send.static(IMAGE, pinhole(lens, 0.3 * setup.distance_m))
+    return turn, centre
+
+
+def _plane_corners(normal: Array, middle: Array, side: float) -> Array:
+    """Corners (4, 3) of a square on a plane; ``side``: half of its side, m."""
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    out: Array = middle + side * np.array([first + second, first - second, -first - second, -first + second])
+    return out
+
+
+def _plane(corners: Array, colour: Colour) -> rr.Mesh3D:
+    return rr.Mesh3D(vertex_positions=corners, triangle_indices=[[0, 1, 2], [0, 2, 3]], albedo_factor=colour)
