@@ -71,8 +71,8 @@ def test_callbacks_get_every_record_and_end_with_the_client(publisher: Published
 
 def test_state_and_reference(publisher: Published, client: Client):
     assert client.state() is None and client.reference() is None
-    publisher.state(state_record(3))
-    publisher.reference(reference_record(2))
+    publisher.event(state_record(3))
+    publisher.event(reference_record(2))
     assert client.state() == state_record(3)
     assert client.reference() == reference_record(2)
 
@@ -99,8 +99,8 @@ def test_a_second_camera_must_be_told_apart(publisher: Published, endpoint: str)
         with Client("arm", connect=[endpoint, second_endpoint]) as client:
             wait_until(lambda: len(client.alive()) == 2, "both monitors")
             assert client.alive() == (MonitorName("arm", "elbow"), MonitorName("arm", "wrist"))
-            second.state(state_record())
-            publisher.state(state_record())
+            second.event(state_record())
+            publisher.event(state_record())
             with pytest.raises(LookupError, match=r"^arm/\* is more than one monitor: arm/\w+, arm/\w+; name the one$"):
                 client.state()
         with Client("arm", "wrist", connect=[endpoint, second_endpoint]) as named:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import logging
+import os
+import re
 import signal
 import sys
 import threading
@@ -15,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.daemon_bench import NEVER, Bench, pause
-from support.loopback import frame_record, reference_record
+from support.loopback import frame_record, reference_record, state_record, wait_until
 from support.stand_ins import REFUSED, ScriptedMonitor
 
 from gripmon.daemon.estimates import EstimatesFile
@@ -151,14 +154,14 @@ def test_alerts_of_the_monitor_go_out_with_their_frame():
     (said,) = bench.network.alerts
     told = msgspec.structs.asdict(alert)
     assert said.seq == 1 and {name: getattr(said, name) for name in told} == told
-    assert bench.recording.alerts == []  # the frame's own record takes it there
+    assert bench.recording.alerts == [said]  # which has it in the frame's own record, and knows
 
 
 def test_a_new_revision_is_published_and_recorded():
     bench = Bench(range(4), ScriptedMonitor(lambda seq: {"revision": 3 if seq < 2 else 4}))
     bench.run()
     assert [reference.revision for reference in bench.network.references] == [3, 4]
-    assert [reference.revision for reference in bench.recording.references] == [4]
+    assert [reference.revision for reference in bench.recording.references] == [3, 4]
     assert (4, 2) in [(state.revision, state.seq) for state in bench.network.states]
 
 
@@ -170,7 +173,7 @@ def test_a_new_reference_is_known_before_anything_names_it():
     assert bench.network.order[first : first + 3] == [("reference", 4), ("transform", 4), ("alert", 4)]
     assert all(revision == 3 for _, revision in bench.network.order[:first])
     without_states = [told for told in bench.recording.order if told[0] != "state"]
-    assert without_states == [("offer", 3), ("reference", 4), ("offer", 4)]
+    assert without_states == [("reference", 3), ("transform", 3), ("reference", 4), ("transform", 4), ("alert", 4)]
 
 
 def test_an_alert_has_the_stamp_of_its_frame():
@@ -256,26 +259,54 @@ def test_without_a_feed_the_frames_opening_stays():
     assert bench.network.transforms[0].jaw_opening_m == 0.03
 
 
+def write(estimates: EstimatesFile, seq: int) -> None:
+    estimates.frame(Frame(seq, 1, None), frame_record(seq), lambda: None)
+
+
+def test_a_disk_that_hangs_holds_no_frame_up_and_what_is_lost_is_counted(tmp_path: Path):
+    """A pipe that nobody reads stands for the disk: it takes 64 KiB, then a write waits for ever."""
+    path = tmp_path / "estimates.jsonl"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    estimates = EstimatesFile(path)
+    record = frame_record(0)
+    for _ in range(6000):
+        estimates.frame(Frame(0, 1, None), record, lambda: None)
+    assert not estimates.has_room
+    missing = int(re.search(r"keep up; (\d+) lines are missing", estimates.failure or "")[1])  # type: ignore[index]
+    lines = 0
+    reading = threading.Thread(target=estimates.close)
+    reading.start()
+    while reading.is_alive():
+        with contextlib.suppress(BlockingIOError):
+            lines += os.read(reader, 1 << 20).count(b"\n")
+    with contextlib.suppress(BlockingIOError):
+        lines += os.read(reader, 1 << 20).count(b"\n")
+    os.close(reader)
+    assert 0 < missing < 2000 and lines + missing == 6000
+
+
 def test_estimates_of_an_earlier_run_are_kept(tmp_path: Path):
     path = tmp_path / "estimates.jsonl"
     for seq in (1, 2, 3):
         estimates = EstimatesFile(path)
-        estimates.write(frame_record(seq))
+        write(estimates, seq)
         estimates.close()
     names = ("estimates-1.jsonl", "estimates-2.jsonl", "estimates.jsonl")
     assert [json.loads((tmp_path / name).read_text())["seq"] for name in names] == [1, 2, 3]
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_estimates_are_on_disk_after_a_flush(tmp_path: Path):
+def test_estimates_are_on_disk_after_a_state_message(tmp_path: Path):
     path = tmp_path / "estimates.jsonl"
     path.write_text("old\n")
     estimates = EstimatesFile(path)
-    estimates.write(frame_record(1))
-    estimates.flush()
+    write(estimates, 1)
+    estimates.event(state_record())
+    wait_until(path.read_text, "the line")
     assert [json.loads(line)["seq"] for line in path.read_text().splitlines()] == [1]
     estimates.close()
-    estimates.write(frame_record(2))
+    write(estimates, 2)
     assert len(path.read_text().splitlines()) == 1
 
 
@@ -286,9 +317,9 @@ def test_estimates_stay_within_their_budget_and_the_newest_are_kept(tmp_path: Pa
     budget_bytes = 200_000
     estimates = EstimatesFile(path, budget_bytes)
     for seq in range(300):
-        estimates.write(frame_record(seq))
+        write(estimates, seq)
         if seq % 3 == 2:
-            estimates.flush()
+            estimates.event(state_record())
     estimates.close()
     files = sorted(tmp_path.glob("estimates-[0-9]*.jsonl"), key=lambda kept: int(kept.stem[10:]))
     assert files[0].name != "estimates-7.jsonl" and (tmp_path / "estimates-x.jsonl").exists()

@@ -30,7 +30,7 @@ def test_a_recording_that_outgrows_its_disk_ends_at_once(disk: Path) -> None:
     for i in range(6):
         writer = recorder(disk / f"run{i}", patience_s=30.0, image_every=1, image_format="png")
         for k in range(60):
-            writer.offer(frame(k, noise(k)[: 200 + 8 * i]), record(k), partial(trace, k))
+            writer.frame(frame(k, noise(k)[: 200 + 8 * i]), record(k), partial(trace, k))
         begun_s = time.monotonic()
         writer.close(60.0)
         assert time.monotonic() - begun_s < 30.0
@@ -47,13 +47,13 @@ def test_a_recording_goes_on_when_there_is_room_again_however_its_writer_died(di
         k = 1000 * i
         while writer.failure is None:
             assert time.monotonic() < deadline_s
-            writer.offer(frame(k, noise(k)), record(k), partial(trace, k))
+            writer.frame(frame(k, noise(k)), record(k), partial(trace, k))
             k += 1
             time.sleep(0.05)
         ballast.unlink()
     wait_until(lambda: writer.path is not None and writer.failure is None, 60.0)
     written = writer.frames_written
-    writer.offer(frame(9000, noise(0)), record(9000), partial(trace, 9000))
+    writer.frame(frame(9000, noise(0)), record(9000), partial(trace, 9000))
     wait_until(lambda: writer.frames_written == written + 1, 60.0)
     last = writer.path
     writer.close(30.0)

@@ -86,12 +86,12 @@ def test_a_webhook_gets_every_alert_in_order_though_it_fails_at_times(monitor: t
     published, endpoint = monitor
     hook = Hook(503, 400)  # tried again; left out, the second time
     slow = Hook()
-    published.alert(alert_record("from before"))
+    published.event(alert_record("from before"))
     try:
         with passing_on(endpoint, "--webhook", hook.url, "--webhook", slow.url):
             wait_until(lambda: slow.texts() == ["from before"], "the last one from before")
-            published.alert(alert_record("second"))
-            published.alert(alert_record("third"))
+            published.event(alert_record("second"))
+            published.event(alert_record("third"))
             wait_until(lambda: len(hook.accepted) == 2, "the others")
     finally:
         hook.close()
@@ -108,7 +108,7 @@ def test_a_broker_gets_what_came_while_it_was_away(monitor: tuple[Published, str
     host, _, port = free_endpoint().removeprefix("tcp/").partition(":")
     (tmp_path / "m.conf").write_text(f"listener {port} {host}\nallow_anonymous true\n")
     heard: list[tuple[str, str]] = []
-    published.alert(alert_record("while it was away"))
+    published.event(alert_record("while it was away"))
     with passing_on(endpoint, "--mqtt", f"{host}:{port}") as process:
         assert process.stderr is not None
         assert f"no connection to {host}:{port}; trying again" in process.stderr.readline()
@@ -121,7 +121,7 @@ def test_a_broker_gets_what_came_while_it_was_away(monitor: tuple[Published, str
             client.connect(host, int(port))
             client.loop_start()
             wait_until(lambda: heard, "the first")
-            published.alert(alert_record("now"))
+            published.event(alert_record("now"))
             wait_until(lambda: len(heard) == 2, "the second")
             client.loop_stop()
     assert heard == [("gripmon/arm/wrist/alert", "while it was away"), ("gripmon/arm/wrist/alert", "now")]

@@ -40,8 +40,8 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     opened = recorder(folder, patience_s=30.0, image_rate_hz=0.0, max_file_bytes=100_000)
     for i in range(COUNT):
         if i % 50 == 0:
-            opened.state(msgspec.structs.replace(state_record(i), stamp_ns=told(i).stamp_ns))
-        opened.offer(dataclasses.replace(frame(i), stamp_ns=told(i).stamp_ns), told(i), lambda i=i: trace(i))
+            opened.event(msgspec.structs.replace(state_record(i), stamp_ns=told(i).stamp_ns))
+        opened.frame(dataclasses.replace(frame(i), stamp_ns=told(i).stamp_ns), told(i), lambda i=i: trace(i))
         if i % 50 == 49:  # so that no file gets all of them at once
             size = bytes_in(folder)
             wait_until(lambda size=size: bytes_in(folder) > size, WAIT_S)

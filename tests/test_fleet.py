@@ -64,9 +64,9 @@ def monitor(fleet: Fleet, central: RouterProcess) -> Iterator[Published]:
         made = Published(PublishSettings(zenoh_config="monitor.json5"), relative_to=fleet.folder)
         try:
             wait_until(lambda: made.connected, "the monitor's connection")
-            made.state(state_record(3))
-            made.reference(reference_record(4))
-            made.alert(alert_record("first"))
+            made.event(state_record(3))
+            made.event(reference_record(4))
+            made.event(alert_record("first"))
             yield made
         finally:
             made.close()
@@ -89,9 +89,9 @@ def what_goes_up(fleet: Fleet, monitor: Published) -> set[str]:
 
         def spoken() -> bool:
             monitor.transform(frame_record())
-            monitor.state(state_record(3))
-            monitor.alert(alert_record("again"))
-            monitor.reference(reference_record(4))
+            monitor.event(state_record(3))
+            monitor.event(alert_record("again"))
+            monitor.event(reference_record(4))
             robot.put(f"{PREFIX}/jaw", "0.02")
             robot.put(f"{PREFIX}/image", bytes(10_000))
             return all(up.count(leaf) >= 10 for leaf in UPWARD) and len(here) >= 10

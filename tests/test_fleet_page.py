@@ -70,7 +70,7 @@ class Cell:
         assert self.monitor.presence is not None
         record = state_record(3)
         values = {"robot": "arm", "monitor_id": self.monitor.presence.monitor_id} | values
-        self.monitor.state(msgspec.structs.replace(record, **values))
+        self.monitor.event(msgspec.structs.replace(record, **values))
 
     def order(self, name: str, argument: str = "", **values: Any) -> Order:
         assert self.monitor.presence is not None

@@ -19,6 +19,7 @@ from gripmon.daemon.running import run
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.geometry import from_record
+from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor
 from gripmon.record.recorder import Recorder
@@ -37,7 +38,7 @@ Three for a file whose plane may be tilted, and what an edge is that wasn't taug
 PACKAGE = str(Path(gripmon.__file__).parent)
 
 
-class Counted:
+class Counted(Output):
     """A source and a publisher around the daemon's loop that count what runs between them."""
 
     live, connected, dropped = False, True, 0
@@ -54,13 +55,13 @@ class Counted:
             sys.setprofile(self._count)
         return frame
 
-    def transform(self, record: FrameRecord) -> None:
-        self._publisher.transform(record)
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        self._publisher.frame(frame, record, trace, notes)
         sys.setprofile(None)
         self.verdicts.append(record.verdict)
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._publisher, name)  # what isn't about a frame
+    def event(self, event: Event) -> None:
+        self._publisher.event(event)
 
     def close(self) -> None: ...
 
@@ -80,7 +81,7 @@ def test_the_way_of_a_frame_gets_no_longer():
     try:
         monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
         run(
-            monitor, source=counted, publisher=counted, recorder=Recorder(), settings=settings.daemon,
+            monitor, source=counted, outputs=(counted,), recorder=Recorder(), settings=settings.daemon,
             robot=settings.robot, camera=settings.camera_name,
         )  # fmt: skip
     finally:

@@ -31,6 +31,7 @@ from support.loopback import (
     state_record,
     wait_until,
 )
+from support.stand_ins import show
 from test_run_on_the_network import PREFIX, configured, refused, running
 
 from gripmon.cli import main
@@ -126,7 +127,7 @@ def test_the_latency_is_a_histogram(server: tuple[MetricsServer, int]):
     values_ns = [round(10 ** chance.uniform(5.0, 9.5)) for _ in range(500)]
     values_ns += [round(1e9 * bound) for bound in LATENCY_BOUNDS_S]  # on a bound counts as below it
     for value in values_ns:
-        tally.transform(frame_record(latency_ns=value))
+        show(tally, frame_record(latency_ns=value))
     found = scraped(port)
     for labels, count in found["gripmon_latency_seconds_bucket"].items():
         bound = float(dict(labels)["le"])
@@ -141,10 +142,10 @@ def test_alerts_are_counted_when_they_are_new(server: tuple[MetricsServer, int])
     others = [msgspec.structs.replace(raised, event=event) for event in (AlertEvent.UPDATED, AlertEvent.CLEARED)]
     noted = msgspec.structs.replace(raised, event=AlertEvent.NOTED, severity=Severity.INFO)
     for alert in (raised, *others, raised, noted):
-        tally.alert(alert)
+        tally.event(alert)
     state = sample_messages.SAMPLES["state"]
     assert isinstance(state, StateRecord)
-    tally.state(state)
+    tally.event(state)
     names = (("cause", "camera_mount_moved"), ("kind", "drift"))
     found = scraped(port)
     assert found["gripmon_alerts_total"] == {
@@ -159,8 +160,8 @@ def test_alerts_are_counted_when_they_are_new(server: tuple[MetricsServer, int])
 def test_what_is_not_known_has_no_sample(server: tuple[MetricsServer, int]):
     tally, port = server
     assert "gripmon_frames_total" not in scraped(port) and "process_resident_memory_bytes" in scraped(port)
-    tally.state(msgspec.structs.replace(state_record(), verdict=Verdict.UNKNOWN, state=State("napping")))
-    tally.transform(frame_record(verdict=Verdict.UNKNOWN, drift=None))
+    tally.event(msgspec.structs.replace(state_record(), verdict=Verdict.UNKNOWN, state=State("napping")))
+    show(tally, frame_record(verdict=Verdict.UNKNOWN, drift=None))
     found = scraped(port)
     assert (
         not {
@@ -172,14 +173,14 @@ def test_what_is_not_known_has_no_sample(server: tuple[MetricsServer, int]):
         & found.keys()
     )
     assert found["gripmon_state"][(("state", "napping"),)] == 1.0 and sum(found["gripmon_state"].values()) == 1.0
-    tally.transform(frame_record())
+    show(tally, frame_record())
     assert math.isclose(only(scraped(port), "gripmon_rotation_radians"), 0.0026)
 
 
 def test_the_bound_and_its_limit_are_gauges(server: tuple[MetricsServer, int]):
     tally, port = server
     by = ValidBy.REFERENCE
-    tally.state(msgspec.structs.replace(state_record(), protection_m=3.5e-4, alert_limit_m=1e-3, valid_by=by))
+    tally.event(msgspec.structs.replace(state_record(), protection_m=3.5e-4, alert_limit_m=1e-3, valid_by=by))
     found = scraped(port)
     assert found["gripmon_valid_by"] == {(("valid_by", "reference"),): 1.0, (("valid_by", "absolute"),): 0.0}
     assert (only(found, "gripmon_protection_meters"), only(found, "gripmon_alert_limit_meters")) == (3.5e-4, 1e-3)
@@ -239,9 +240,9 @@ def test_the_page_lists_what_there_is(server: tuple[MetricsServer, int]):
     tally, port = server
     state = sample_messages.SAMPLES["state"]
     assert isinstance(state, StateRecord)
-    tally.state(state)
-    tally.alert(alert_record())
-    tally.transform(frame_record())
+    tally.event(state)
+    tally.event(alert_record())
+    show(tally, frame_record())
     page = (ROOT / "docs" / "howto" / "metrics.md").read_text(encoding="utf-8")
     found = {name for name in scraped(port) if name.startswith("gripmon_")}
     families = {re.sub(r"(?<=_seconds)_(bucket|sum|count)$", "", name) for name in found}

@@ -25,6 +25,7 @@ import pytest
 import yaml
 from support import sample_messages
 from support.loopback import WAIT_S, accepts, alert_record, frame_record, free_endpoint, wait_until
+from support.stand_ins import show
 
 from gripmon.daemon.service import ServiceManager, log_to_stderr
 from gripmon.io.metrics import MetricsServer, MetricsSettings
@@ -169,9 +170,9 @@ def metrics() -> Iterator[int]:
     with contextlib.closing(MetricsServer(MetricsSettings(enabled=True, port=port), "arm1", "wrist")) as server:
         state = sample_messages.SAMPLES["state"]
         assert isinstance(state, StateRecord)
-        server.state(state)
-        server.alert(alert_record())
-        server.transform(frame_record(verdict=Verdict.VALID))
+        server.event(state)
+        server.event(alert_record())
+        show(server, frame_record(verdict=Verdict.VALID))
         yield port
 
 

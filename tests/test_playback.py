@@ -162,7 +162,7 @@ def test_a_folder_with_two_robots(run: Run, tmp_path: Path):
         shutil.copy(path, tmp_path)
     other = new_recorder(tmp_path, "second", robot="left")
     for i in range(5):
-        other.offer(frame(i), record(i), lambda: trace(0))
+        other.frame(frame(i), record(i), lambda: trace(0))
     wait_until(lambda: other.frames_written == 5)
     other.close(30.0)
     seen: list[tuple[int, int]] = []

@@ -108,7 +108,7 @@ def test_cut_anywhere_never_raises(run: Run, tmp_path: Path):
 def test_a_killed_recording_process_leaves_a_file_that_reads(tmp_path: Path):
     recorder = new_recorder(tmp_path / "live", max_file_bytes=10**9)
     for i in range(50):
-        recorder.offer(frame(i), record(i), lambda: trace(0))
+        recorder.frame(frame(i), record(i), lambda: trace(0))
     wait_until(lambda: recorder.frames_written == 50)
     assert recorder.process_id is not None
     os.kill(recorder.process_id, signal.SIGKILL)

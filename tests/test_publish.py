@@ -22,9 +22,7 @@ from support.loopback import (
 )
 from support.published import Published
 
-from gripmon.io.publish import Publisher
 from gripmon.io.wire import Keys, PublishError, PublishSettings
-from gripmon.model.records import Verdict
 
 PREFIX = "gripmon/arm/wrist"
 
@@ -71,7 +69,7 @@ def test_transform_on_the_wire(publisher: Published, session: zenoh.Session):
 
 
 def test_alert_on_the_wire(publisher: Published, session: zenoh.Session):
-    sample = received(session.declare_subscriber(f"{PREFIX}/alert"), lambda: publisher.alert(alert_record("it moved")))
+    sample = received(session.declare_subscriber(f"{PREFIX}/alert"), lambda: publisher.event(alert_record("it moved")))
     message = json.loads(sample.payload.to_bytes())
     assert (message["kind"], message["cause"], message["text"]) == ("drift", "camera_mount_moved", "it moved")
 
@@ -80,7 +78,7 @@ def test_alert_on_the_wire(publisher: Published, session: zenoh.Session):
 def test_late_joiners_get_the_last_one(publisher: Published, endpoint: str, leaf: str):
     records = [state_record(i) for i in (1, 2)] if leaf == "state" else [reference_record(i) for i in (1, 2)]
     for record in records:
-        getattr(publisher, leaf)(record)
+        publisher.event(record)
     expected = json.loads(msgspec.json.encode(records[-1]))
     with plain_session(connect=endpoint) as session:
         assert ask(session, f"{PREFIX}/{leaf}") == [expected]
@@ -91,7 +89,7 @@ def test_late_joiners_get_the_last_one(publisher: Published, endpoint: str, leaf
         samples: list[zenoh.Sample] = []
         wait_until(lambda: (sample := subscriber.try_recv()) is not None and not samples.append(sample), "history")
         assert [json.loads(sample.payload.to_bytes()) for sample in samples] == [expected]
-        getattr(publisher, leaf)(records[0])
+        publisher.event(records[0])
         wait_until(lambda: (sample := subscriber.try_recv()) is not None and not samples.append(sample), "the next one")
         assert json.loads(samples[-1].payload.to_bytes()) == json.loads(msgspec.json.encode(records[0]))
 
@@ -139,11 +137,11 @@ def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str)
         assert not publisher.connected
         for record in (frame_record(1), frame_record(2)):
             publisher.transform(record)
-        publisher.state(state_record(1))
-        publisher.state(state_record(2))
-        publisher.reference(reference_record(4))
-        publisher.alert(alert_record("first"))
-        publisher.alert(alert_record("second"))
+        publisher.event(state_record(1))
+        publisher.event(state_record(2))
+        publisher.event(reference_record(4))
+        publisher.event(alert_record("first"))
+        publisher.event(alert_record("second"))
         assert publisher.unsent == 2
         with plain_session(listen=endpoint, mode="router") as router:
             wait_until(lambda: publisher.connected, "the session")
@@ -177,7 +175,7 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
     path.write_text(text)
     publisher = Published(PublishSettings(zenoh_config=path.name), "arm", "wrist", relative_to=tmp_path)
     try:
-        publisher.state(state_record(5))
+        publisher.event(state_record(5))
         with plain_session(connect=endpoint) as session:
             assert ask(session, f"{PREFIX}/state")[0]["seq"] == 5
         with pytest.raises(PublishError, match=rf"^publish.zenoh_config: {endpoint} is already in use"):
@@ -276,12 +274,3 @@ def test_a_jaw_opening_grows_old_though_nobody_asked(endpoint: str):
             assert publisher.jaw.fault() == "no jaw opening for 0.2 s or longer"
     finally:
         publisher.close()
-
-
-def test_the_publisher_that_says_nothing_takes_everything():
-    publisher = Publisher()
-    publisher.transform(frame_record(verdict=Verdict.UNKNOWN))
-    publisher.state(state_record())
-    publisher.alert(alert_record())
-    publisher.reference(reference_record())
-    publisher.close()

@@ -75,8 +75,12 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     directory = tmp_path_factory.mktemp("story")
     writer = recorder(directory, truth, image_rate_hz=1000.0, image_format="png", queue_images=32)
     for i in range(COUNT):
-        writer.offer(frame(i), story(i), partial(trace, i))
-    writer.alert(
+        writer.frame(frame(i), story(i), partial(trace, i))
+        for alert in story(i).alerts:  # which the daemon publishes with more words: not recorded a second time
+            about = {**msgspec.structs.asdict(alert), "text": f"{alert.text}; to accept it: …"}
+            names = {"robot": "arm", "camera": "wrist", "reference_id": "first", "revision": 1}
+            writer.event(AlertRecord(seq=i, stamp_ns=story(i).stamp_ns, state=State.DRIFTING, **names, **about))
+    writer.event(
         AlertRecord(
             robot="arm",
             camera="wrist",
@@ -261,7 +265,7 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64, around_alert_s=0.0)
     for i in range(60):
         state = State.DRIFTING if i in (31, 32) else State.TRACKING
-        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), partial(trace, i))
+        writer.frame(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), partial(trace, i))
     writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
@@ -276,8 +280,8 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
     moved = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2)
     writer = recorder(tmp_path)
     for i in range(12):
-        writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
-    writer.reference(moved)
+        writer.frame(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
+    writer.event(moved)
     writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
@@ -291,9 +295,9 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
 def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     for i in range(3):
-        writer.offer(frame(i), record(i), lambda: None)
+        writer.frame(frame(i), record(i), lambda: None)
     wait_until(lambda: writer.frames_written == 3)
-    writer.alert(
+    writer.event(
         AlertRecord(
             robot="arm",
             camera="wrist",
@@ -317,7 +321,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
 def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; from support.recorded import *; w = recorder(Path(sys.argv[1]));"
-        "w.offer(frame(0), record(0), lambda: trace(0)); w.close(60.0);"
+        "w.frame(frame(0), record(0), lambda: trace(0)); w.close(60.0);"
         "assert w.frames_written == 1, w.failure; assert 'rerun' not in sys.modules"
     )
     here = Path(__file__).parent
@@ -338,7 +342,7 @@ def test_disabled_recording_touches_nothing(tmp_path: Path) -> None:
         directory=tmp_path / "none",
     )
     assert type(writer) is Recorder
-    writer.offer(frame(0), record(0), lambda: None)
+    writer.frame(frame(0), record(0), lambda: None)
     writer.close()
     assert not (tmp_path / "none").exists()
 

@@ -105,13 +105,13 @@ SILENT = AlertRecord(
 def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     directory = tmp_path_factory.mktemp("told")
     writer = recorder(directory, configuration=CONFIGURATION, image_rate_hz=1000.0, queue_images=32)
-    writer.state(state(-1, State.ACQUIRING))
+    writer.event(state(-1, State.ACQUIRING))
     for i in range(COUNT):
-        writer.offer(frame(i), told_of(i), partial(trace, i), partial(notes, i))
+        writer.frame(frame(i), told_of(i), partial(trace, i), partial(notes, i))
     wait_until(lambda: writer.frames_written == COUNT)
-    writer.command(COMMAND)
-    writer.state(state(COUNT - 1, State.STALE))
-    writer.alert(SILENT)
+    writer.event(COMMAND)
+    writer.event(state(COUNT - 1, State.STALE))
+    writer.event(SILENT)
     writer.close(60.0)
     (path,) = directory.glob("*.rrd")
     return Recorded(path)
@@ -253,13 +253,13 @@ def test_a_later_file_stands_alone(tmp_path: Path) -> None:
     writer = recorder(
         tmp_path, patience_s=5.0, configuration=CONFIGURATION, max_file_bytes=100_000, image_rate_hz=1000.0
     )
-    writer.reference(moved)
+    writer.event(moved)
     i = 0
     while len(list(tmp_path.glob("*.rrd"))) < 3:
         assert i < 2000, "no third file"
         of_second = {"reference_id": "second", "revision": 2, "stamp_ns": START_NS + i * INTERVAL_NS}
         said = msgspec.structs.replace(told_of(i % 7), seq=i, **of_second)
-        writer.offer(frame(i), said, partial(trace, 3), partial(notes, 9))
+        writer.frame(frame(i), said, partial(trace, 3), partial(notes, 9))
         i += 1
     writer.close(60.0)
     alone = Recorded(tmp_path / "run-0002.rrd")

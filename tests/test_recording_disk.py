@@ -63,7 +63,7 @@ def freezable_disk(tmp_path: Path) -> Iterator[Path]:
 
 def offer(writer: ProcessRecorder, first: int, count: int) -> None:
     for i in range(first, first + count):
-        writer.offer(frame(i), record(i), partial(trace, i))
+        writer.frame(frame(i), record(i), partial(trace, i))
 
 
 def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
@@ -79,7 +79,7 @@ def test_a_disk_that_is_read_only(small_disk: Path) -> None:
     assert "recording failed: can't write" in str(writer.failure)
     offer(writer, 0, 10)
     wait_until(lambda: writer.dropped == 10, LONG_S)
-    writer.alert(alert_record(text="recording failed"))
+    writer.event(alert_record(text="recording failed"))
     command("mount", "-o", "remount,rw", str(small_disk))
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 10, 10)

@@ -53,7 +53,7 @@ PICTURE = image(0)
 
 def offer(writer: ProcessRecorder, first: int, count: int) -> None:
     for i in range(first, first + count):
-        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+        writer.frame(frame(i, PICTURE), record(i), partial(trace, i))
 
 
 def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
@@ -234,13 +234,13 @@ def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> No
     offer_and_wait(writer, 0, 5)
     moved = to_record(make_transform(np.eye(3), np.array([0.002, 0.003, 0.2])))
     new = ReferenceRecord("second", 2, START_NS + 5 * INTERVAL_NS, "recalibration", moved, (0.0,) * 36)
-    writer.reference(new)
+    writer.event(new)
     for i in range(5, 8):
-        writer.offer(frame(i), record(i, reference_id="second", revision=2), partial(trace, i))
+        writer.frame(frame(i), record(i, reference_id="second", revision=2), partial(trace, i))
     wait_until(lambda: writer.frames_written == 8)
     os.kill(worker, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
-    writer.offer(frame(8), record(8, reference_id="second", revision=2), partial(trace, 8))
+    writer.frame(frame(8), record(8, reference_id="second", revision=2), partial(trace, 8))
     wait_until(lambda: writer.frames_written == 9)
     writer.close(60.0)
     told = Recorded(tmp_path / "run-0002.rrd")

@@ -30,7 +30,7 @@ from gripmon.model.records import (
 
 def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), lambda: None)
+    writer.frame(frame(0), record(0), lambda: None)
     writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
@@ -53,8 +53,8 @@ def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
 def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.ndarray) -> None:
     refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image", source=Origin.HELD)
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), partial(trace, 0))
-    writer.offer(frame(1, picture), refused, lambda: None)
+    writer.frame(frame(0), record(0), partial(trace, 0))
+    writer.frame(frame(1, picture), refused, lambda: None)
     writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
@@ -67,7 +67,7 @@ def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
     none = np.empty((0, 2))
     empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), np.empty(0), (), np.full((8, 2), np.nan))
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0, corners=()), lambda: empty)
+    writer.frame(frame(0), record(0, corners=()), lambda: empty)
     writer.close(60.0)
     assert writer.failure is None and writer.dropped == 0
     (path,) = tmp_path.glob("*.rrd")

@@ -58,7 +58,7 @@ def run_through(writer: ProcessRecorder, first: int, count: int, alerts: dict[in
         return len(writer._frames) == 0 and worker.images_sent == writer._status.images_done
 
     for i in range(first, first + count):
-        writer.offer(frame(i), record(i, alerts=(alerts[i],) if i in alerts else ()), partial(trace, i))
+        writer.frame(frame(i), record(i, alerts=(alerts[i],) if i in alerts else ()), partial(trace, i))
         if i % 4 == 0:
             wait_until(caught_up, timeout_s=60.0)
 
@@ -93,7 +93,7 @@ def test_an_alert_of_the_daemon_s_own_keeps_the_images_before_it(tmp_path: Path)
     writer = recorder(tmp_path, image_rate_hz=0.0, around_alert_s=0.5, queue_images=64)
     run_through(writer, 0, 100, {})
     wait_until(lambda: writer.frames_written == 100)
-    writer.alert(own(Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, "no frame for 5 s"), 99))
+    writer.event(own(Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, "no frame for 5 s"), 99))
     writer.close(60.0)
     (path,) = files_in(tmp_path)
     # The first frame's image is there because the state was new with it.

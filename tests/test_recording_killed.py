@@ -43,7 +43,7 @@ while True:
     at = started + i * 16_666_667
     time.sleep(max(0.0, 1e-9 * (at - time.time_ns())))
     f = frame(i)
-    w.offer(Frame(i, at, f.image), record(i, stamp_ns=at), lambda: trace(i))
+    w.frame(Frame(i, at, f.image), record(i, stamp_ns=at), lambda: trace(i))
     i += 1
     print(w.frames_written, i, at, flush=True)
 """
@@ -142,7 +142,7 @@ def test_a_killed_recorders_file_is_told_with_the_command_that_makes_it_whole(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), lambda: None)
+    writer.frame(frame(0), record(0), lambda: None)
     wait_until(lambda: writer.frames_written == 1)
     assert writer.process_id is not None and writer.path is not None
     killed = writer.path

@@ -59,7 +59,7 @@ def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: p
     process = stopped(writer)
     with caplog.at_level(logging.WARNING, "gripmon.record"):
         for i in range(30):
-            writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+            writer.frame(frame(i, PICTURE), record(i), partial(trace, i))
         wait_until(lambda: "missing in the recording so far: frames: 0" in caplog.text)
         os.kill(process, signal.SIGCONT)
         writer.close(60.0)
@@ -73,11 +73,11 @@ def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_p
     writer = recorder(tmp_path, image_rate_hz=0.0, queue_images=4)
     process = stopped(writer)
     for i in range(30):
-        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+        writer.frame(frame(i, PICTURE), record(i), partial(trace, i))
     os.kill(process, signal.SIGCONT)
     wait_until(lambda: writer.frames_written == 30)
     assert writer.images_dropped == 0
-    writer.offer(frame(30, PICTURE), record(30, alerts=(DRIFT,)), partial(trace, 30))
+    writer.frame(frame(30, PICTURE), record(30, alerts=(DRIFT,)), partial(trace, 30))
     wait_until(lambda: writer.frames_written == 31)
     writer.close(60.0)
     assert 0 < writer.images_dropped == 31 - len(pictures(tmp_path))
@@ -86,7 +86,7 @@ def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_p
 def test_whoever_can_wait_gets_all_images_around_an_alert(tmp_path: Path) -> None:
     writer = recorder(tmp_path, patience_s=30.0, image_rate_hz=0.0, queue_images=4)
     for i in range(60):
-        writer.offer(frame(i, PICTURE), record(i, alerts=(DRIFT,) * (i == 40)), partial(trace, i))
+        writer.frame(frame(i, PICTURE), record(i, alerts=(DRIFT,) * (i == 40)), partial(trace, i))
     writer.close(30.0)
     assert (writer.dropped, writer.images_dropped, pictures(tmp_path)) == (0, 0, set(range(60)))
 

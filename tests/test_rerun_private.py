@@ -27,7 +27,7 @@ def test_they_are_used_in_one_file_alone():
 def test_without_its_chunk_index_files_are_read_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     writer = recorder(tmp_path)
     for i in range(10):
-        writer.offer(frame(i), record(i), lambda: None)
+        writer.frame(frame(i), record(i), lambda: None)
     writer.close(30.0)
     (path,) = tmp_path.glob("*.rrd")
     (whole,) = open_recordings([path]).recordings

@@ -18,6 +18,7 @@ from support.loopback import (
     wait_until,
 )
 from support.ros2_graph import ON, layout, tokens
+from support.stand_ins import show
 
 from gripmon.io.ros2.names import NodeName, Ros2Settings, dds_type
 from gripmon.io.ros2.node import HeardTopic, Listeners, gid_of, type_hash
@@ -68,7 +69,7 @@ class Bench:
 
     def _mark(self) -> bytes:
         self._marks += 1
-        self.publisher.state(msgspec.structs.replace(state_record(), version=f"mark-{self._marks:04}"))
+        self.publisher.event(msgspec.structs.replace(state_record(), version=f"mark-{self._marks:04}"))
         return f"mark-{self._marks:04}".encode()
 
     def _marked(self, mark: bytes) -> bool:
@@ -95,8 +96,8 @@ def values(payload: bytes) -> dict[str, str]:
 
 def test_a_valid_frame(make_bench: Callable[..., Bench]):
     bench, record = make_bench(), frame_record()
-    bench.publisher.transform(record)
-    bench.publisher.reference(reference_record())
+    show(bench.publisher, record)
+    bench.publisher.event(reference_record())
     payloads = bench.payloads()
     assert set(payloads) == {TF_KEY, POSE_KEY}
     (placed,) = idl.TFMessage.deserialize(payloads[TF_KEY]).transforms
@@ -114,7 +115,7 @@ def test_smoothed_inverse_on_another_domain_under_other_names(make_bench: Callab
         parent_frame="tcp", child_frame="corrected_camera", transform="smoothed", tf_topic="tf", pose_topic="camera",
     )  # fmt: skip
     bench, record = make_bench(settings), frame_record()
-    bench.publisher.transform(record)
+    show(bench.publisher, record)
     payloads = bench.payloads()
     tf_key, pose_key = sorted(payloads, reverse=True)
     assert tf_key.startswith("42/cell_3/tf/tf2_msgs::") and pose_key.startswith("42/cell_3/camera/geometry_msgs::")
@@ -126,7 +127,7 @@ def test_smoothed_inverse_on_another_domain_under_other_names(make_bench: Callab
     assert placed.transform.rotation == idl.Quaternion(*expected.rotation_xyzw)
     pose = idl.PoseWithCovarianceStamped.deserialize(payloads[pose_key])
     assert pose.pose.covariance == covariance.tolist()
-    bench.publisher.transform(frame_record(smoothed=None))
+    show(bench.publisher, frame_record(smoothed=None))
     assert not bench.published()
 
 
@@ -147,8 +148,8 @@ def test_what_may_not_be_used_is_not_broadcast(
     make_bench: Callable[..., Bench], verdicts: tuple[str, ...], changes: dict[str, object], published: bool, why: str
 ):
     bench = make_bench(Ros2Settings(enabled=True, verdicts=verdicts))
-    bench.publisher.transform(frame_record(**changes))
-    bench.publisher.state(state_record())
+    show(bench.publisher, frame_record(**changes))
+    bench.publisher.event(state_record())
     payloads = bench.payloads()
     assert set(payloads) == ({TF_KEY, POSE_KEY, DIAGNOSTICS_KEY} if published else {DIAGNOSTICS_KEY})
     assert values(payloads[DIAGNOSTICS_KEY])["broadcast"] == why
@@ -159,22 +160,22 @@ def test_diagnostics_follow_the_alerts(make_bench: Callable[..., Bench]):
     assert values_after(bench, lambda: None)["broadcast"] == "no: no frame yet"
     raised = msgspec.structs.replace(alert_record(), event=AlertEvent.RAISED, alert_id="drift-7")
     # Said at once, not with the next state.
-    bench.publisher.alert(raised)
+    bench.publisher.event(raised)
     (sample,) = bench.published()
     assert status(sample.payload.to_bytes()).level == 1 and "moved 1.5 mm" in status(sample.payload.to_bytes()).message
     worse = msgspec.structs.replace(raised, event=AlertEvent.UPDATED, severity=Severity.ERROR, text="moved 4 mm")
-    bench.publisher.alert(worse)
+    bench.publisher.event(worse)
     (sample,) = bench.published()
     assert status(sample.payload.to_bytes()).level == 2
     assert values(sample.payload.to_bytes())["alerts"] == "drift (error)"
-    bench.publisher.alert(msgspec.structs.replace(worse, event=AlertEvent.CLEARED))
+    bench.publisher.event(msgspec.structs.replace(worse, event=AlertEvent.CLEARED))
     (sample,) = bench.published()
     assert status(sample.payload.to_bytes()).level == 0 and values(sample.payload.to_bytes())["alerts"] == ""
-    bench.publisher.alert(alert_record())  # only noted: neither open nor over
+    bench.publisher.event(alert_record())  # only noted: neither open nor over
     assert not bench.published()
     # The state knows of those, too, that were raised before this node was there.
     kept = StandingAlert("creep-2", AlertKind.CREEP, Severity.WARNING, "creeps", 5, acknowledged=False)
-    bench.publisher.state(msgspec.structs.replace(state_record(), open_alerts=(kept,)))
+    bench.publisher.event(msgspec.structs.replace(state_record(), open_alerts=(kept,)))
     (sample,) = bench.published()
     assert status(sample.payload.to_bytes()).level == 1
     assert values(sample.payload.to_bytes())["alerts"] == "creep (warning)"
@@ -182,14 +183,14 @@ def test_diagnostics_follow_the_alerts(make_bench: Callable[..., Bench]):
 
 def values_after(bench: Bench, act: Callable[[], None]) -> dict[str, str]:
     act()
-    bench.publisher.state(state_record())
+    bench.publisher.event(state_record())
     return values(bench.payloads()[DIAGNOSTICS_KEY])
 
 
 def test_attachments_count_and_name_the_publisher(make_bench: Callable[..., Bench]):
     bench = make_bench()
     for seq in range(3):
-        bench.publisher.transform(frame_record(seq))
+        show(bench.publisher, frame_record(seq))
     samples = [sample for sample in bench.published() if str(sample.key_expr) == TF_KEY]
     fields = tuple[zenoh.ext.Int64, zenoh.ext.Int64, bytes]
     numbers, stamps_ns, gids = zip(
@@ -219,7 +220,7 @@ def test_the_node_is_in_the_graph_until_it_closes(make_bench: Callable[..., Benc
     assert len(set(ids)) == len(ids) == 4
     bench.publisher.close()
     wait_until(lambda: not tokens(bench.session), "the tokens to go")
-    bench.publisher.transform(frame_record())  # and nothing is raised
+    show(bench.publisher, frame_record())  # and nothing is raised
 
 
 def test_a_client_whose_router_comes_late():
@@ -227,15 +228,15 @@ def test_a_client_whose_router_comes_late():
     endpoint = free_endpoint()
     link = Link(PublishSettings(mode="client", connect=(endpoint,), retry_longest_s=0.25))
     publisher = Ros2Publisher(link, ON, layout())
-    publisher.state(state_record())
-    publisher.transform(frame_record())
+    publisher.event(state_record())
+    show(publisher, frame_record())
     with plain_session(listen=endpoint, mode="router") as session:
         samples: list[zenoh.Sample] = []
         subscriber = session.declare_subscriber(TF_KEY, samples.append)
         wait_until(lambda: len(tokens(session)) == 4, "the node")
 
         def arrives() -> bool:
-            publisher.transform(frame_record(9))
+            show(publisher, frame_record(9))
             return bool(samples)
 
         wait_until(arrives, "a transform")
@@ -257,7 +258,7 @@ def test_the_node_is_back_after_a_restart_of_the_router():
             subscriber = session.declare_subscriber(TF_KEY, samples.append)
 
             def arrives(samples: list[zenoh.Sample] = samples) -> bool:
-                publisher.transform(frame_record())
+                show(publisher, frame_record())
                 return bool(samples)
 
             wait_until(arrives, "a transform")

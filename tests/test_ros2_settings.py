@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from pathlib import Path
 
 import msgspec
 import pytest
 from support.loopback import (
-    alert_record,
     frame_record,
     free_endpoint,
-    reference_record,
-    state_record,
 )
 from support.ros2_graph import ON, layout, tokens
-from support.stand_ins import Listener, ScriptedMonitor, TickingSource
+from support.stand_ins import show
 
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
-from gripmon.daemon.estimates import EstimatesFile
-from gripmon.daemon.loop import Daemon
-from gripmon.daemon.neighbours import Reports
-from gripmon.daemon.watch import DaemonSettings
-from gripmon.io.publish.publisher import Publishers
 from gripmon.io.ros2.names import Layout, NodeName, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.stopping import StopRequest
 
 
 def test_one_line_turns_it_on(tmp_path: Path):
@@ -99,65 +89,6 @@ def test_without_publishing_there_is_no_node():
 # --- failures ---
 
 
-class Failing(Listener):
-    """Fails in everything, also in closing."""
-
-    def __init__(self) -> None:
-        super().__init__(fails="everything", closing_fails=True)
-
-
-def test_a_failing_node_stops_neither_the_loop_nor_the_other_publisher(caplog: pytest.LogCaptureFixture):
-    """Nor does it count as an error of the daemon, which gives up after some."""
-    caplog.set_level(logging.ERROR)
-    first = Listener()
-    stop = StopRequest()
-    monitor = ScriptedMonitor(lambda seq: stop.request(0) or {} if seq == 20 else {})
-    both = Publishers(first, {"ROS 2": Failing()})
-    daemon = Daemon(
-        monitor,
-        source=TickingSource(200.0),
-        publisher=both,
-        recorder=Listener(),
-        settings=DaemonSettings(give_up_after_errors=3, state_period_s=0.01),
-        stop=stop,
-        robot="arm",
-        camera="wrist",
-        estimates=EstimatesFile(None),
-        reports=Reports((both.fault,)),
-    )
-    assert daemon.run() == 0
-    assert [record.seq for record in first.transforms] == list(range(21))
-    assert "ROS 2 fails: " in first.states[-1].message
-    assert len(first.references) == 1
-    said = [record for record in caplog.records if "ROS 2 fails" in record.message]
-    assert 1 <= len(said) <= 4  # once for each kind of message
-
-
-def test_the_first_publishers_failure_is_the_daemons_to_know():
-    """And the others have the record all the same; an other's fault is forgotten when it works again."""
-    other, failing = Listener(), Listener(fails="everything")
-    publishers = Publishers(failing, {"ROS 2": other})
-    for put, record in (
-        (publishers.transform, frame_record()),
-        (publishers.state, state_record()),
-        (publishers.alert, alert_record()),
-        (publishers.reference, reference_record()),
-    ):
-        with pytest.raises(OSError, match="the line is cut"):
-            put(record)
-    assert (len(other.transforms), len(other.states), len(other.alerts), len(other.references)) == (1, 1, 1, 1)
-    first, flaky = Listener(), Listener(fails="transform")
-    publishers = Publishers(first, {"ROS 2": flaky})
-    publishers.transform(frame_record())
-    publishers.state(state_record())
-    assert publishers.fault() == "ROS 2 fails: the line is cut"
-    flaky.fails = ""
-    publishers.transform(frame_record())
-    assert publishers.fault() == ""
-    publishers.close()
-    assert (first.closed, flaky.closed) == (1, 1)
-
-
 def test_a_node_that_can_not_be_declared_says_so_with_every_record():
     """Others wait for the same session."""
     link = Link(PublishSettings(listen=(free_endpoint(),)))
@@ -167,6 +98,6 @@ def test_a_node_that_can_not_be_declared_says_so_with_every_record():
     link.attach(reached.append)
     assert reached
     with pytest.raises(RuntimeError, match="could not be declared: topic '/not a topic'"):
-        publisher.transform(frame_record())
+        show(publisher, frame_record())
     assert not tokens(reached[0])  # nor is half a node in the graph
     link.close()

@@ -68,9 +68,9 @@ def heard() -> Iterator[dict[str, list[object]]]:
                     said(session, "transform", lambda: publisher.transform(frame_record())),
                     said(session, "transform", lambda: publisher.transform(NULLS), NULLS.seq),
                 ],
-                "state": [said(session, "state", lambda: publisher.state(state_record()))],
-                "alert": [said(session, "alert", lambda: publisher.alert(alert_record()))],
-                "reference": [said(session, "reference", lambda: publisher.reference(reference_record()))],
+                "state": [said(session, "state", lambda: publisher.event(state_record()))],
+                "alert": [said(session, "alert", lambda: publisher.event(alert_record()))],
+                "reference": [said(session, "reference", lambda: publisher.event(reference_record()))],
                 "reply": [asked(session, publisher, "state", None)],
                 "error": [asked(session, publisher, "explode", None), asked(session, publisher, "undo", b"no JSON")],
             }

@@ -81,10 +81,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         answering.start()
         try:
             wait_until(lambda: made.monitor.connected, "the monitor's connection")
-            made.monitor.state(state_record(3))
-            made.monitor.reference(reference_record(4))
-            made.monitor.alert(alert_record("first"))
-            made.monitor.alert(alert_record("second"))
+            made.monitor.event(state_record(3))
+            made.monitor.event(reference_record(4))
+            made.monitor.event(alert_record("first"))
+            made.monitor.event(alert_record("second"))
             yield made
         finally:
             made.closing.set()
@@ -108,7 +108,7 @@ def test_controllers_and_tables_of_monitors_work_through_the_rules(site: Site, n
     with TransformClient("arm", "wrist", zenoh_config_file=file) as client, Fleet(zenoh_config_file=file) as fleet:
         wait_until(lambda: site.monitor.transform(frame_record()) or client.latest().usable, "a transform")
         wait_until(
-            lambda: site.monitor.state(state_record(3)) or [s.condition for s in fleet.monitors()] == [Condition.VALID],
+            lambda: site.monitor.event(state_record(3)) or [s.condition for s in fleet.monitors()] == [Condition.VALID],
             "the state",
         )
 
@@ -151,7 +151,7 @@ def test_the_page_of_the_fleet_can_do_what_its_certificate_may(site: Site):
             page = FleetSite(fleet)
 
             def shown(page: FleetSite = page) -> bool:
-                site.monitor.state(state_record(3))
+                site.monitor.event(state_record(3))
                 return [card.condition for card in page.shown().cards] == [Condition.VALID]
 
             wait_until(shown, "the monitor on the page")
@@ -225,7 +225,7 @@ def test_a_controller_can_neither_speak_for_a_monitor_nor_for_the_jaw(site: Site
         _token = controller.liveliness().declare_token("gripmon/fake/wrist/alive")
         assert ask(controller, f"{PREFIX}/state")[0]["seq"] == 3  # so that the router has had what came before
         wait_until(lambda: robot.put(f"{PREFIX}/jaw", "0.02") or heard, "the robot's opening")
-        wait_until(lambda: site.monitor.state(state_record(3)) or read, "a state")
+        wait_until(lambda: site.monitor.event(state_record(3)) or read, "a state")
         assert set(heard) == {0.02} and b"666" not in read
         alive = operator.liveliness().get("gripmon/*/*/alive", timeout=2.0)
         assert [str(reply.ok.key_expr) for reply in alive] == [f"{PREFIX}/alive"]

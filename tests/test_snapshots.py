@@ -58,7 +58,7 @@ class Running:
     def _run(self) -> None:
         items = (self._frames(i) for i in itertools.takewhile(lambda _: not self._stop.wait(0.005), itertools.count()))
         run(
-            Monitor(), source=ScriptedSource(items, live=True), publisher=self.publisher, recorder=self.recording,
+            Monitor(), source=ScriptedSource(items, live=True), outputs=(self.publisher,), recorder=self.recording,
             settings=DaemonSettings(state_period_s=NEVER), robot="arm", camera="wrist",
             commands=self.publisher.commands, reports=Reports(),
         )  # fmt: skip

@@ -185,7 +185,7 @@ def test_watch_shows_both(two: tuple[Published, Published], router: str, capsys:
 
         def listed() -> list[tuple[str, Condition]]:
             for each in two:
-                each.state(state_record())
+                each.event(state_record())
             mine = [each for each in fleet.monitors() if each.name.camera == two[0].keys.camera]
             return sorted((each.monitor_id, each.condition) for each in mine if each.state is not None)
 

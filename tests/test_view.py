@@ -127,7 +127,7 @@ def test_a_live_view_that_cannot_be_served_costs_nothing_else(tmp_path: Path, ca
         view = ViewSettings(port=other.getsockname()[1], web_port=free_port())
         recorder = live_recorder(tmp_path, view, recorded.settings())
         for seq in range(20):
-            recorder.offer(recorded.frame(seq), recorded.record(seq), lambda: None)
+            recorder.frame(recorded.frame(seq), recorded.record(seq), lambda: None)
         wait_until(lambda: "the live view can't be served" in caplog.text, "it is said")
         wait_until(lambda: recorder.frames_written == 20, "all on disk")
         assert recorder.failure is None
@@ -149,7 +149,7 @@ def two_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     image = np.full((recorded.HEIGHT_PX, recorded.WIDTH_PX, 3), MAGENTA, np.uint8)
     seq = 0
     while len(list(folder.glob("*.rrd"))) < 2:
-        opened.offer(recorded.frame(seq, image), recorded.record(seq), lambda: None)
+        opened.frame(recorded.frame(seq, image), recorded.record(seq), lambda: None)
         seq += 1
         wait_until(lambda count=seq: opened.frames_written >= count - 20, "it is written")
     opened.close(timeout_s=60.0)

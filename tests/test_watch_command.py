@@ -151,7 +151,7 @@ def test_one_alert_log_through_a_router_that_is_restarted(endpoints: tuple[str, 
 
     try:
         for monitor, robot in zip(monitors, ("one", "two"), strict=True):
-            monitor.alert(said_by(robot, "before"))
+            monitor.event(said_by(robot, "before"))
         with watching("--alerts", "--json", "--out", str(log), "--connect", endpoint) as (_, lines):
             with router(endpoint):
                 wait_until(lambda: log.exists() and len(texts()) >= 4, "two monitors and what they said before")

@@ -1,77 +1,107 @@
-"""A file with one JSON line per frame or pulse."""
+"""A file with one JSON line per frame."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import queue
 import re
+import threading
 from pathlib import Path
 from typing import IO
 
-from gripmon.model.records import FrameRecord, to_json
+from gripmon.model.outputs import Event, Notes, Output, Trace
+from gripmon.model.records import Frame, FrameRecord, StateRecord, to_json
 
 _log = logging.getLogger(__name__)
 _BUFFER_BYTES = 1 << 16
 _FILES = 10  # the budget is for this many files
+_WAITING = 4096
+"""Most records that wait for the disk: a minute at 60 frames/s."""
+_CLOSE_WITHIN_S = 2.0
 
 
-class EstimatesFile:
+class EstimatesFile(Output):
     """Begins a new file; an earlier one is kept beside it (``estimates-1.jsonl``, …, the newest has the highest
-    number). Without a path it writes nothing.
+    number).
 
-    A file that reaches a tenth of ``budget_bytes`` is kept likewise, and the oldest beyond the budget are deleted,
-    including those of earlier runs; 0: one file without limit.
-
-    A disk that fails later must not stop the monitor: ``failure`` then says what is wrong, and writing ends.
+    A thread writes, so that a disk that doesn't answer holds no frame up: lines wait, and beyond some thousand are
+    dropped and counted.  A file that reaches a tenth of ``budget_bytes`` is kept as one of an earlier run is, and the
+    oldest beyond the budget are deleted; 0: one file without limit.  A disk that fails later must not stop the monitor:
+    ``failure`` then says what is wrong, and writing ends.
     """
 
-    def __init__(self, path: Path | None, budget_bytes: int = 0) -> None:
+    name = "estimates"
+
+    def __init__(self, path: Path, budget_bytes: int = 0) -> None:
         """Raises OSError if the file can't be opened."""
-        self.failure: str | None = None
         self._path, self._budget_bytes = path, budget_bytes
-        self._file: IO[bytes] | None = None if path is None else self._begin(path)
+        self._fault: str | None = None
+        self._missing = 0
+        self._waiting: queue.Queue[FrameRecord | None] = queue.Queue(_WAITING)  # None: flush
+        self._ends = False
+        self._file = self._begin()
+        self._thread = threading.Thread(target=self._run, name="gripmon-estimates", daemon=True)
+        self._thread.start()
 
-    def write(self, record: FrameRecord) -> None:
-        """Add a line; it is written by the next :meth:`flush`."""
-        if self._file is not None:
-            try:
-                self._file.write(to_json(record) + b"\n")
-            except OSError as error:
-                self._give_up(error)
+    @property
+    def failure(self) -> str | None:
+        """What is wrong, in one line; None while nothing is."""
+        if self._fault is not None or not self._missing:
+            return self._fault
+        return f"{self._path}: the disk doesn't keep up; {self._missing} lines are missing"
 
-    def flush(self) -> None:
-        """Write what has been added; called between frames, since it also starts a new file when this one is full."""
-        if self._file is not None and self._path is not None:
+    @property
+    def has_room(self) -> bool:
+        return self._fault is not None or not self._waiting.full()
+
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """Add a line; it is on the disk after the next state message at the latest, if the disk answers."""
+        if self._fault is None:
             try:
-                self._file.flush()
-                if 0 < self._budget_bytes <= _FILES * self._file.tell():
-                    self._file.close()
-                    self._file = self._begin(self._path)
-            except OSError as error:
-                self._give_up(error)
+                self._waiting.put_nowait(record)
+            except queue.Full:
+                self._missing += 1
+
+    def event(self, event: Event) -> None:
+        """Write out what was added, with every state message."""
+        if isinstance(event, StateRecord) and not self._waiting.full():
+            self._waiting.put(None)
 
     def close(self) -> None:
-        if self._file is not None:
-            file, self._file = self._file, None
-            try:
-                file.close()
-            except OSError as error:
-                self._give_up(error)
+        """Write what waits, for at most two seconds."""
+        self._ends = True
+        if not self._waiting.full():
+            self._waiting.put(None)
+        self._thread.join(_CLOSE_WITHIN_S)
+        if self._thread.is_alive():
+            _log.error("%s: the disk doesn't answer; %d lines are missing", self._path, self._waiting.qsize())
 
-    def _begin(self, path: Path) -> IO[bytes]:
+    def _run(self) -> None:
+        file = self._file
+        try:
+            while not (self._ends and self._waiting.empty()):
+                record = self._waiting.get()
+                if record is not None:
+                    file.write(to_json(record) + b"\n")
+                    continue
+                file.flush()
+                if 0 < self._budget_bytes <= _FILES * file.tell():
+                    file.close()
+                    file = self._begin()
+            file.close()
+        except OSError as error:
+            self._fault = f"{self._path} can't be written: {error.strerror}"
+            _log.error("%s", self._fault)
+            with contextlib.suppress(OSError):  # the same fault once more
+                file.close()
+
+    def _begin(self) -> IO[bytes]:
         """Open a new file, after making room for it."""
-        _set_aside(path)
+        _set_aside(self._path)
         if self._budget_bytes > 0:
-            _remove_oldest(path, self._budget_bytes - self._budget_bytes // _FILES)
-        return path.open("wb", buffering=_BUFFER_BYTES)
-
-    def _give_up(self, error: OSError) -> None:
-        self.failure = f"{self._path} can't be written: {error.strerror}"
-        _log.error("%s", self.failure)
-        file, self._file = self._file, None
-        if file is not None:
-            with contextlib.suppress(OSError):  # the same fault once more; logged above
-                file.close()
+            _remove_oldest(self._path, self._budget_bytes - self._budget_bytes // _FILES)
+        return self._path.open("wb", buffering=_BUFFER_BYTES)
 
 
 def _set_aside(path: Path) -> None:

@@ -11,12 +11,12 @@ from typing import Unpack
 
 import msgspec
 
-from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import JawFeed
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
 from gripmon.model.errors import in_short
+from gripmon.model.outputs import Output
 from gripmon.model.records import (
     Command,
     CommandReply,
@@ -42,7 +42,6 @@ class Daemon(Loop):
         self,
         monitor: Monitor,
         *,
-        estimates: EstimatesFile,
         jaw: JawFeed | None = None,
         keeper: StateKeeper | None = None,
         odd_about: Callable[[Image], str | None] = lambda _: None,
@@ -52,13 +51,13 @@ class Daemon(Loop):
         super().__init__(**parts)
         self._monitor = monitor
         self._odd_about: Callable[[Image], str | None] | None = odd_about
-        self._estimates = estimates
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
         self._kept_revision: int | None = None
         self._beside = ThreadPoolExecutor(1, "analysis")
         self._working: Future[None] | None = None
-        self._reference, self._reference_due = monitor.reference, True
+        self._reference = monitor.reference
+        self._untold: list[Output] = list(self._outputs)  # of the reference
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
 
     @property
@@ -83,19 +82,20 @@ class Daemon(Loop):
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
         several = self._not_alone()
-        self._deliver("transform", self._publisher.transform, withheld(record, several) if several else record)
+        told = withheld(record, several) if several else record
+        trace, notes = self._monitor.trace, self._monitor.notes
+        for output in self._outputs:
+            self._deliver(output.name, output.frame, frame, told if output.public else record, trace, notes)
         self._newest = Newest(frame, record, time.monotonic())
         # Everything below is less urgent.
         self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:
-            self._alert(alert, record.state, frame.stamp_ns, recorded=True)
+            self._alert(alert, record.state, frame.stamp_ns)
         for alert in self._watch.frame(record, time.monotonic()):
             self._alert(alert, record.state, frame.stamp_ns)
-        self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace, self._monitor.notes)
-        self._deliver("estimates", self._estimates.write, record)
         self._deliver("learning", self._monitor.learn)
         self._work_beside_the_frames()
-        undelivered = "; ".join(self._faults.values())
+        undelivered = "; ".join(dict.fromkeys(self._faults.values()))
         self._faults.clear()
         for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
             self._alert(alert, record.state, frame.stamp_ns)
@@ -162,13 +162,11 @@ class Daemon(Loop):
         newest, known = self._monitor.reference, self._reference
         if (newest.reference_id, newest.revision) != (known.reference_id, known.revision):
             self._deliver("state's keeping", self._keep_now)
-            self._reference, self._reference_due = newest, True
-            self._deliver("recording", self._recorder.reference, newest)
-        if self._reference_due:
-            self._reference_due = not self._deliver("reference", self._publisher.reference, self._reference)
+            self._reference, self._untold = newest, list(self._outputs)
+        if self._untold:
+            self._untold = self._tell(self._reference, self._untold)
 
     def _housekeeping(self) -> None:
-        self._estimates.flush()
         if (now_s := time.monotonic()) >= self._next_keeping_s:
             # Only for the last transform: where to search first after a restart.
             self._next_keeping_s = now_s + KEEP_LAST_EVERY_S

@@ -9,17 +9,17 @@ import logging
 from gripmon.daemon.config import Config, ConfigError, check_network
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import ZenohCommands
 from gripmon.io.publish.inputs import ZenohJaw, opening_of_joints
 from gripmon.io.publish.presence import Presence, in_words
-from gripmon.io.publish.publisher import Publishers, ZenohPublisher
+from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
 from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
 from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.sources import NetworkCamera, NetworkSettings, Source
 from gripmon.io.wire import Keys, Link, PublishError
 from gripmon.model.errors import NoResultError
+from gripmon.model.outputs import Output
 
 _log = logging.getLogger(__name__)
 
@@ -32,15 +32,20 @@ class NameTakenError(NoResultError):
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """The session (None: nothing is published), the publisher, the sources of the jaw opening (None: the frames) and
+    """The session (None: nothing is published), the outputs, the sources of the jaw opening (None: the frames) and
     of commands, and the reports of all these for the state message.
     """
 
     link: Link | None
-    publisher: Publisher
+    outputs: tuple[Output, ...] = ()
     jaw: JawFeed | None = None
     commands: ZenohCommands | None = None
     reports: Reports = dataclasses.field(default_factory=Reports)
+
+    def close(self) -> None:
+        """Close the outputs, the link last."""
+        for output in reversed(self.outputs):
+            output.close()
 
 
 def open_network(config: Config, *, take_over: bool = False) -> Network:
@@ -50,7 +55,7 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
     jaw = None
     if config.settings.jaw.source == "fixed":
         jaw = _FixedJaw(config.jaw_opening_m)
-    network = Network(None, Publisher(), jaw)
+    network = Network(None, jaw=jaw)
     link = _open_link(config)
     if link is not None:
         settings = config.settings
@@ -97,16 +102,14 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
     heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
     ros2 = _ros2_node(config, link)
     _show_listeners(config, link)
-    publishers = Publishers(publisher, {} if ros2 is None else {"ROS 2": ros2})
-    faults = (link.fault, publishers.fault)
     reports = Reports(
-        faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
+        (link.fault,), lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
     )
-    return Network(link, publishers, jaw, commands, reports)
+    return Network(link, (publisher,) if ros2 is None else (publisher, ros2), jaw, commands, reports)
 
 
 def _with_metrics(config: Config, network: Network) -> Network:
-    """Add the metrics server for Prometheus to the publisher if configured.  Raises :class:`ConfigError` if it can't
+    """Add the metrics server for Prometheus to the outputs if configured.  Raises :class:`ConfigError` if it can't
     listen.
     """
     settings = config.settings
@@ -115,10 +118,10 @@ def _with_metrics(config: Config, network: Network) -> Network:
     try:
         metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
     except MetricsError as error:
-        network.publisher.close()
+        network.close()
         raise ConfigError(config.path, "", str(error)) from None
     _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return dataclasses.replace(network, publisher=Publishers(network.publisher, {"metrics": metrics}))
+    return dataclasses.replace(network, outputs=(*network.outputs, metrics))
 
 
 def with_source(reports: Reports, source: Source) -> Reports:
@@ -131,7 +134,7 @@ def with_source(reports: Reports, source: Source) -> Reports:
     )
 
 
-def _ros2_node(config: Config, link: Link) -> Publisher | None:
+def _ros2_node(config: Config, link: Link) -> Output | None:
     """The monitor as a ROS 2 node, if configured."""
     settings = config.settings
     if not settings.ros2.enabled:

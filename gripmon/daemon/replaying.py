@@ -95,7 +95,7 @@ def replay(
     while (frame := source.read()) is not None:
         assert isinstance(frame, Frame), "only a live source waits"
         while waiting and waiting[0].seq < frame.seq:
-            recorder.command(_repeated(monitor, waiting.popleft()))
+            recorder.event(_repeated(monitor, waiting.popleft()))
         if not ignored and monitor.ignores_opening(frame):
             ignored = True
             warn("the frames have jaw openings, but jaw.source is fixed: they are not used")
@@ -108,8 +108,8 @@ def replay(
         record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
         if monitor.reference.revision != revision:
             revision = monitor.reference.revision
-            recorder.reference(monitor.reference)
-        recorder.offer(frame, record, monitor.trace, monitor.notes)
+            recorder.event(monitor.reference)
+        recorder.frame(frame, record, monitor.trace, monitor.notes)
         yield record
 
 

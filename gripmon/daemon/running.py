@@ -53,9 +53,8 @@ def run(
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame, the source failed, or
     internal errors persisted; 130 SIGINT.
     """
-    with _closing(parts, estimates, jaw, keeper, outlines) as lines:
-        daemon = Daemon(monitor, estimates=lines, jaw=jaw, keeper=keeper, odd_about=odd_about, **parts)
-        return daemon.run(duration_s)
+    with _closing(parts, estimates, jaw, keeper, outlines):
+        return Daemon(monitor, jaw=jaw, keeper=keeper, odd_about=odd_about, **parts).run(duration_s)
 
 
 @contextlib.contextmanager
@@ -65,8 +64,8 @@ def _closing(
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
-) -> Iterator[EstimatesFile]:
-    """Opens the file for lines, and adds the faults of all these and the snapshots to ``parts``.
+) -> Iterator[None]:
+    """Adds the file for lines to the outputs, and the faults of all these and the snapshots to ``parts``.
 
     Signals request a stop.  Everything is closed in any case, which a second signal can't interrupt.
     """
@@ -76,18 +75,23 @@ def _closing(
         # All of these run, in reverse order.
         if keeper is not None:
             closing.callback(keeper.close)
-        closing.callback(parts["publisher"].close)
+        for output in reversed(parts["outputs"]):
+            closing.callback(output.close)
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(parts["source"].close)
-        file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
+        file = None if lines is None else EstimatesFile(lines, settings.estimates_budget_bytes)
+        if file is not None:
+            closing.callback(file.close)
+            parts["outputs"] = (*parts["outputs"], file)
         parts["snapshots"] = closing.enter_context(contextlib.closing(Snapshots(outlines)))
         faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
-        faults += [lambda: recorder.failure, lambda: file.failure]
+        faults += [lambda: recorder.failure]
+        faults += [] if file is None else [lambda: file.failure]
         faults += [] if keeper is None else [lambda: keeper.failure]
         reports = parts.get("reports") or Reports()
         parts["reports"] = replace(reports, faults=(*faults, *reports.faults))
         with _steady_interpreter():
-            yield file
+            yield
 
 
 def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:

@@ -118,7 +118,7 @@ def run_monitor(
             if refused is not None:
                 _log.warning("%s", refused)
         network = open_network(config, take_over=take_over)
-        opened.callback(network.publisher.close)
+        opened.callback(network.close)
         on_network()
         compiled = warm_up()  # before the first frame
         gc.collect()  # takes 0.1 s; the loop's own collection then skips the frozen objects
@@ -139,7 +139,7 @@ def run_monitor(
         return run(
             monitor,
             source=source,
-            publisher=network.publisher,
+            outputs=network.outputs,
             recorder=recorder,
             settings=settings.daemon,
             robot=settings.robot,

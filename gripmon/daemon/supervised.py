@@ -17,12 +17,12 @@ from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.commands import PendingCommand, ZenohCommands
 from gripmon.io.publish.presence import in_words
 from gripmon.io.sources import Source, Waiting
 from gripmon.model.coverage import too_few
 from gripmon.model.errors import in_short
+from gripmon.model.outputs import Event, Output
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -58,10 +58,10 @@ _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Sever
 
 
 class Parts(TypedDict, total=False):
-    """Keyword arguments of every :class:`Loop`."""
+    """Keyword arguments of every :class:`Loop`.  ``outputs``: besides ``recorder``, the most urgent first."""
 
     source: Required[Source]
-    publisher: Required[Publisher]
+    outputs: Required[Sequence[Output]]
     recorder: Required[Recorder]
     settings: Required[DaemonSettings]
     stop: StopRequest | None
@@ -78,7 +78,8 @@ class Loop(ABC):
 
     def __init__(self, **parts: Unpack[Parts]) -> None:
         self._source = parts["source"]
-        self._publisher, self._recorder = parts["publisher"], parts["recorder"]
+        self._recorder = parts["recorder"]
+        self._outputs: tuple[Output, ...] = (*parts["outputs"], self._recorder)
         self._settings = parts["settings"]
         self._robot, self._camera = parts["robot"], parts["camera"]
         self._commands = parts.get("commands")
@@ -156,7 +157,7 @@ class Loop(ABC):
     def _next_item(self) -> bool:
         """Wait for the source and handle its item; False if there is nothing more to do."""
         self._handle_command()
-        if not self._source.live and not self._recorder.has_room:
+        if not self._source.live and not all(output.has_room for output in self._outputs):
             time.sleep(ROOM_POLL_S)
             self._publish_state(time.monotonic())
             return True
@@ -209,22 +210,28 @@ class Loop(ABC):
         text = result if answer is None else answer.text
         carried_out = answer is not None and answer.done
         recorded = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
-        self._deliver("command's recording", self._recorder.command, recorded)
+        self._tell(recorded)
         answer = self._settle(answer)
         if answer and answer.done and command.name is CommandName.SNAPSHOT:
             self._deliver("answer", self._snapshots.answer, asked, answer, self._newest)
         else:
             self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, result))
 
+    def _tell(self, event: Event, outputs: Sequence[Output] | None = None) -> list[Output]:
+        """Pass an event to all outputs, or to some; returns those that failed."""
+        told = self._outputs if outputs is None else outputs
+        return [output for output in told if not self._deliver(output.name, output.event, event)]
+
     def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
         """Pass something to one receiver, whose failure must not affect others; False if it failed, which is logged."""
+        kind = f"{what} {put.__name__}"  # an output may take frames and no events
         try:
             put(*values, **named)
         except Exception as error:  # noqa: BLE001  logged here, an alert at the end of the frame
-            self._faults[what] = f"{what} not delivered: {in_short(error)}"
-            self._log_once(what, "", self._faults[what], error)
+            self._faults[kind] = f"{what} fails: {in_short(error)}"
+            self._log_once(kind, "", self._faults[kind], error)
             return False
-        self._logged_faults.pop(what, None)
+        self._logged_faults.pop(kind, None)
         return True
 
     def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:
@@ -234,12 +241,8 @@ class Loop(ABC):
             _log.error("%s%s", where, text)
             _log.debug("%s%s", where, what, exc_info=error)
 
-    def _alert(self, alert: Alert, state: State, stamp_ns: int | None = None, *, recorded: bool = False) -> None:
-        """Publish and log an alert.
-
-        ``stamp_ns``: of the alert's frame, if there is one; ``recorded``: the frame's record already has it in the
-        recording.
-        """
+    def _alert(self, alert: Alert, state: State, stamp_ns: int | None = None) -> None:
+        """Publish and log an alert; ``stamp_ns``: of its frame, if there is one."""
         about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
         alert = self._with_command(alert)
         _log.log(_LEVELS[alert.severity], "%s: %s", about, alert.text)
@@ -253,9 +256,7 @@ class Loop(ABC):
             revision=self._in_force[1],
             **msgspec.structs.asdict(alert),
         )
-        self._deliver("alert", self._publisher.alert, message)
-        if not recorded:
-            self._deliver("alert's recording", self._recorder.alert, message)
+        self._tell(message)
 
     def _not_alone(self) -> str:
         """A message while other monitors have this name, else empty; no transform is published then, since readers
@@ -298,8 +299,7 @@ class Loop(ABC):
             _log.info("%s", line)
             self._service.status(line)
         self._last_state = self._state_record(verdict, message, now_s, alone=not several)
-        self._deliver("state", self._publisher.state, self._last_state)
-        self._deliver("state's recording", self._recorder.state, self._last_state)
+        self._tell(self._last_state)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
             self._housekeeping()

@@ -22,13 +22,14 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 import msgspec
 from msgspec import Meta
 
-from gripmon.io.publish import Publisher
 from gripmon.model.errors import InputError
+from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
     AlertRecord,
     Cause,
+    Frame,
     FrameRecord,
     Severity,
     State,
@@ -52,8 +53,11 @@ _BOUNDS_NS = tuple(round(1e9 * bound) for bound in LATENCY_BOUNDS_S)
 _COUNTED = (AlertEvent.RAISED, AlertEvent.NOTED)  # updates and ends are not counted as alerts
 
 
-class Tally(Publisher):
-    """A publisher that only counts and keeps the newest.  One thread puts; others read, at worst a frame apart."""
+class Tally(Output):
+    """An output that only counts and keeps the newest.  One thread puts; others read, at worst a frame apart."""
+
+    name = "metrics"
+    public = True
 
     def __init__(self) -> None:
         self.state_record: StateRecord | None = None
@@ -63,21 +67,19 @@ class Tally(Publisher):
         self.verdicts = dict.fromkeys(Verdict, 0)
         self.alerts: dict[tuple[AlertKind, Cause, Severity], int] = {}
 
-    def transform(self, record: FrameRecord) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Count a frame."""
         self.latencies[bisect_left(_BOUNDS_NS, record.latency_ns)] += 1
         self.latency_sum_ns += record.latency_ns
         self.verdicts[record.verdict] += 1
         self.record = record
 
-    def state(self, record: StateRecord) -> None:
-        """Keep the state."""
-        self.state_record = record
-
-    def alert(self, record: AlertRecord) -> None:
-        """Count an alert that is new."""
-        if record.event in _COUNTED:
-            key = (record.kind, record.cause, record.severity)
+    def event(self, event: Event) -> None:
+        """Keep the state; count an alert that is new."""
+        if isinstance(event, StateRecord):
+            self.state_record = event
+        elif isinstance(event, AlertRecord) and event.event in _COUNTED:
+            key = (event.kind, event.cause, event.severity)
             self.alerts[key] = self.alerts.get(key, 0) + 1
 
 
@@ -94,7 +96,7 @@ def package_fault(settings: MetricsSettings) -> tuple[str, str, str] | None:
 
 
 class MetricsServer(Tally):
-    """A publisher that counts its records and serves the counts at ``/metrics``."""
+    """An output that counts its records and serves the counts at ``/metrics``."""
 
     def __init__(self, settings: MetricsSettings, robot: str, camera: str) -> None:
         """Start listening immediately, in a separate thread.  Raises :class:`MetricsError`."""

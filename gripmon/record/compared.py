@@ -12,6 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gripmon.model.errors import one_line
+from gripmon.model.outputs import Event, Notes, Trace
 from gripmon.model.records import Frame, FrameRecord, Limits
 from gripmon.record.columns import (
     APPLICATION_ID,
@@ -27,7 +28,7 @@ from gripmon.record.columns import (
     two_columns,
 )
 from gripmon.record.read import RecordedFrames
-from gripmon.record.recorder import Events, Notes, Recorder, Scene, Trace, pack_trace
+from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
 from gripmon.record.rows import CurveWriter, RowWriter
 from gripmon.record.scene import rig_view, wrist_image_view
 from gripmon.record.worker import measured_picture
@@ -85,7 +86,7 @@ class ComparedRecorder(Recorder):
         self._events = Events.at_first(scene.reference)
         self._commands_then = list(source.commands)
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """One frame with its new record; the recorded one comes from the source."""
         then, shot = self._source.record, self._source.shot
         assert then is not None, "every replayed frame has a record"
@@ -101,8 +102,8 @@ class ComparedRecorder(Recorder):
         if len(self._rows) >= _BATCH_ROWS:
             self._write()
 
-    def happened(self, events: Events) -> None:
-        self._events += events
+    def event(self, event: Event) -> None:
+        self._events += Events.of(event)
 
     def close(self, timeout_s: float = 2.0) -> None:
         self._write()

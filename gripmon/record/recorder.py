@@ -8,7 +8,6 @@ ever blocks the interpreter in which the loop runs.  The daemon itself never imp
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable
 from typing import Annotated, Literal
 
 import msgspec
@@ -19,13 +18,12 @@ from numpy.typing import NDArray
 from gripmon import __version__
 from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.outputs import Event, Output
 from gripmon.model.records import (
     AlertRecord,
-    Frame,
     FrameRecord,
     Limits,
     MeasurementTrace,
-    MonitorNotes,
     RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
@@ -37,9 +35,6 @@ LOOPBACK = "127.0.0.1"
 RECORDING_PATIENCE_S = 30.0
 """How long a source that can wait, and is read faster than any camera, waits for the recording before a frame is
 dropped (s)."""
-
-Trace = Callable[[], MeasurementTrace | None]
-Notes = Callable[[], MonitorNotes]
 
 
 class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -143,14 +138,14 @@ class ViewSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return f"rerun+http://{LOOPBACK}:{self.port}/proxy"
 
 
-class Recorder:
-    """The interface of a recording to the loops: it never blocks, and counts what it has to drop.  This base class
-    records nothing.
+class Recorder(Output):
+    """A recording, as an output; this base class records nothing.
 
     ``dropped`` counts frames that are not in the recording, ``images_dropped`` images missing from recorded frames;
-    ``failure`` says why nothing is being written, None while all is well.  ``has_room``: nothing would be dropped now,
-    or waiting would not help; a source that can wait does so until then.
+    ``failure`` says why nothing is being written, None while all is well.
     """
+
+    name = "recording"
 
     @property
     def dropped(self) -> int:
@@ -161,33 +156,8 @@ class Recorder:
         return 0
 
     @property
-    def has_room(self) -> bool:
-        return True
-
-    @property
     def failure(self) -> str | None:
         return None
-
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """Record a frame.  Before this returns, ``notes`` is called, and ``trace`` if the picture is recorded."""
-
-    def happened(self, events: Events) -> None:
-        """Record events that belong to no frame."""
-
-    def alert(self, alert: AlertRecord) -> None:
-        """Record an alert that belongs to no frame, such as a lost camera; frame records contain the others."""
-        self.happened(Events(alerts=[alert]))
-
-    def reference(self, reference: ReferenceRecord) -> None:
-        """Record a new reference; the first one is in the scene."""
-        self.happened(Events(references=[reference]))
-
-    def command(self, command: RecordedCommand) -> None:
-        """Record a command and its result."""
-        self.happened(Events(commands=[command]))
-
-    def state(self, state: StateRecord) -> None:
-        self.happened(Events(states=[state]))
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Write what is queued, finish the file and release everything, within ``timeout_s``, then by force."""
@@ -279,6 +249,15 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
     references: list[ReferenceRecord] = []
     commands: list[RecordedCommand] = []
     states: list[StateRecord] = []
+
+    @staticmethod
+    def of(event: Event) -> Events:
+        """One event."""
+        if isinstance(event, AlertRecord):
+            return Events(alerts=[event])
+        if isinstance(event, ReferenceRecord):
+            return Events(references=[event])
+        return Events(commands=[event]) if isinstance(event, RecordedCommand) else Events(states=[event])
 
     @staticmethod
     def at_first(reference: ReferenceRecord | None) -> Events:

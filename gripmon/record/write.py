@@ -16,7 +16,9 @@ import msgspec
 
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
+from gripmon.model.outputs import Event, Notes, Trace
 from gripmon.model.records import (
+    AlertRecord,
     Frame,
     FrameRecord,
     Image,
@@ -32,12 +34,10 @@ from gripmon.record.recorder import (
     Events,
     FrameNote,
     ImageNote,
-    Notes,
     Recorder,
     RecordingSettings,
     Scene,
     Status,
-    Trace,
     ViewSettings,
     make_scene,
     pack_trace,
@@ -75,7 +75,7 @@ class _Waiting(NamedTuple):
 class ProcessRecorder(Recorder):
     """Records through a separate process.
 
-    ``offer`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
+    ``frame`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
     afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread copies images into shared memory and
     writes everything else, in batches, to a pipe.  If the recording process can't keep up, first images and then frames
     are dropped and counted.  If it dies, it is started again and begins a new file.
@@ -93,6 +93,7 @@ class ProcessRecorder(Recorder):
         self._images_offered = self._images_not_queued = 0
         self._image_stamp_ns: int | None = None
         self._shown: tuple[State, Verdict, str, int] | None = None
+        self._newest_record: FrameRecord | None = None
         # Appended to by the loop's thread, emptied by the hand-over thread.
         self._frames: deque[_Waiting] = deque()
         self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
@@ -153,8 +154,9 @@ class ProcessRecorder(Recorder):
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as configured, and at events."""
+        self._newest_record = record
         if self._patience_s > 0.0:
             self._wait_for_room()
         if len(self._frames) >= self._settings.queue_frames:
@@ -181,8 +183,19 @@ class ProcessRecorder(Recorder):
             item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, due, lost)
         self._frames.append(item)
 
-    def happened(self, events: Events) -> None:
-        self._events.append(events)
+    def event(self, event: Event) -> None:
+        """Record what is neither in the scene nor in a frame's record."""
+        if not (isinstance(event, AlertRecord) and self._is_in_record(event)) and event != self._scene.reference:
+            self._events.append(Events.of(event))
+
+    def _is_in_record(self, alert: AlertRecord) -> bool:
+        """Whether it is one of the newest frame's own alerts, to whose text the loop may have added."""
+        record = self._newest_record
+        return record is not None and (alert.seq, alert.stamp_ns) == (record.seq, record.stamp_ns) and any(
+            (own.kind, own.event, own.alert_id) == (alert.kind, alert.event, alert.alert_id)
+            and alert.text.startswith(own.text)
+            for own in record.alerts
+        )
 
     def close(self, timeout_s: float = 2.0) -> None:
         if self._closing.is_set():
@@ -368,7 +381,7 @@ def open_recorder(
     ``directory`` replaces that of the settings, ``name`` the default, made of robot, camera and
     time of day.  ``truth_tcp_m``, from a simulator, maps a frame's ``seq`` to the TCP's true position in the camera
     frame, whose shift from the reference is drawn beside the estimate; it is called in another thread than the loop's.
-    ``patience_s``: how long ``offer`` may wait for room before it drops a frame, for input that can wait, such as a
+    ``patience_s``: how long ``frame`` may wait for room before it drops a frame, for input that can wait, such as a
     folder; 0 for a camera.  ``configuration`` is written into every file.  ``view``: viewers may connect and see frames
     as they are recorded, also if recording itself is off.  Raises OSError if the directory can't be made.
     """

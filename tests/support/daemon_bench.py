@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 from gripmon.daemon.running import run
 from gripmon.daemon.watch import DaemonSettings
+from gripmon.model.outputs import Output
 from gripmon.model.records import (
     AlertKind,
     Cause,
@@ -23,13 +24,14 @@ class Bench:
     def __init__(self, items: Iterable[object], monitor: ScriptedMonitor | None = None, **settings: object) -> None:
         self.source = ScriptedSource(items)
         self.monitor = monitor or ScriptedMonitor()
-        self.network, self.recording = Listener(), Listener()
+        self.network, self.recording = Listener("Zenoh"), Listener("recording")
+        self.others: tuple[Output, ...] = ()
         self.settings = DaemonSettings(**{"state_period_s": NEVER, **settings})  # type: ignore[arg-type]
 
     def run(self, **more: object) -> int:
         return run(
-            self.monitor, source=self.source, publisher=self.network, recorder=self.recording, settings=self.settings,
-            robot="arm", camera="wrist", **more,  # type: ignore[arg-type]
+            self.monitor, source=self.source, outputs=(self.network, *self.others), recorder=self.recording,
+            settings=self.settings, robot="arm", camera="wrist", **more,  # type: ignore[arg-type]
         )  # fmt: skip
 
     @property

@@ -35,13 +35,13 @@ if __name__ == "__main__":
         if kind == "forgetful":
             raise SystemExit(5)  # without closing the publisher
         if kind == "starting":
-            publisher.state(state_record())
+            publisher.event(state_record())
             time.sleep(WAIT_S)
         sys.exit(
             run(
                 ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
                 source=SilentSource(FRAMES_PER_S) if kind == "silent" else TickingSource(FRAMES_PER_S),
-                publisher=publisher,
+                outputs=(publisher,),
                 recorder=Listener(),
                 settings=DaemonSettings(no_camera_alert_after_s=0.5),
                 robot="arm",

@@ -147,13 +147,13 @@ def write_run(directory: Path) -> Run:
                 traces[seq] = trace(seq % 50)
                 return traces[seq]
 
-            recorder.offer(seen, made, traced)
+            recorder.frame(seen, made, traced)
             records.append(made)
         if number == 1:
-            recorder.alert(OWN_ALERT)
-            recorder.command(COMMAND)
-            recorder.reference(SECOND)
-            recorder.state(state_record(70))
+            recorder.event(OWN_ALERT)
+            recorder.event(COMMAND)
+            recorder.event(SECOND)
+            recorder.event(state_record(70))
         wait_until(lambda: recorder.frames_written == len(records))
     recorder.close(30.0)
     assert recorder.dropped == 0 and recorder.images_dropped == 0

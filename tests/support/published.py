@@ -9,6 +9,8 @@ from gripmon.io.publish.inputs import ZenohJaw
 from gripmon.io.publish.presence import Presence
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Keys, Link, PublishSettings
+from gripmon.model.records import FrameRecord
+from support.stand_ins import show
 
 
 class Published(ZenohPublisher):
@@ -33,6 +35,10 @@ class Published(ZenohPublisher):
         self.jaw = ZenohJaw(self.link, self.keys["jaw"])
         if settings.commands:
             self.commands = ZenohCommands(self.link, self.keys, self.presence)
+
+    def transform(self, record: FrameRecord) -> None:
+        """One frame's record."""
+        show(self, record)
 
     @property
     def connected(self) -> bool:

@@ -85,7 +85,7 @@ def _main() -> int:
         return run(
             ScriptedMonitor(lambda _: answer),
             source=TickingSource(told["fps"]),
-            publisher=publisher,
+            outputs=(publisher,),
             recorder=Listener(),
             settings=DaemonSettings(),
             robot=told["robot"],

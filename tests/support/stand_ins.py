@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from gripmon.io.sources import Waiting
+from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import (
     AlertRecord,
     Command,
@@ -24,7 +26,7 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.record.recorder import Notes, Trace
+from gripmon.record.recorder import Recorder
 from support.loopback import frame_record, reference_record
 
 REFUSED = {
@@ -36,6 +38,11 @@ REFUSED = {
 }
 
 NOTES = MonitorNotes(0.5, Limits(1e-4, 3e-3, 2.5e-3, 0.02, (1e-5,) * 6, None, None, None, (1.0,) * 6, (0.0,) * 6))
+
+
+def show(output: Output, record: FrameRecord) -> None:
+    """A frame's record to an output that needs nothing else of it."""
+    output.frame(Frame(record.seq, record.stamp_ns, None), record, lambda: None)
 
 
 class ScriptedMonitor:
@@ -119,46 +126,40 @@ class ScriptedSource:
         self.closed += 1
 
 
-class Listener:
-    """Publisher and recorder at once: writes everything down, except what ``fails`` names ("everything": all)."""
+class Listener(Recorder):
+    """A recorder, or any output: writes everything down, except what ``fails`` names ("everything": all)."""
 
-    def __init__(self, *, fails: str = "", closing_fails: bool = False) -> None:
+    dropped = images_dropped = 0  # type: ignore[assignment]
+    has_room = True  # type: ignore[assignment]
+    failure: str | None = None  # type: ignore[assignment]
+
+    def __init__(self, name: str = "listener", *, fails: str = "", closing_fails: bool = False) -> None:
+        self.name, self.public = name, name != "recording"
         self.transforms: list[FrameRecord] = []
         self.states: list[StateRecord] = []
         self.alerts: list[AlertRecord] = []
         self.references: list[ReferenceRecord] = []
-        self.offered: list[tuple[Frame, FrameRecord]] = []
         self.commands: list[RecordedCommand] = []
+        self.offered: list[tuple[Frame, FrameRecord]] = []
         self.closed = 0
-        self.dropped = self.images_dropped = 0
-        self.has_room = True
-        self.failure: str | None = None
         self.order: list[tuple[str, int]] = []  # what came, and the revision that it names
         self.fails, self._closing_fails = fails, closing_fails
 
-    def transform(self, record: FrameRecord) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         self._take("transform", record.revision)
         self.transforms.append(record)
-
-    def state(self, record: StateRecord) -> None:
-        self._take("state", record.revision)
-        self.states.append(record)
-
-    def alert(self, record: AlertRecord) -> None:
-        self._take("alert", record.revision)
-        self.alerts.append(record)
-
-    def reference(self, record: ReferenceRecord) -> None:
-        self._take("reference", record.revision)
-        self.references.append(record)
-
-    def command(self, record: RecordedCommand) -> None:
-        self._take("command", record.seq)
-        self.commands.append(record)
-
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        self._take("offer", record.revision)
         self.offered.append((frame, record))
+
+    def event(self, event: Event) -> None:
+        kinds: dict[type, tuple[str, list[Any]]] = {
+            StateRecord: ("state", self.states),
+            AlertRecord: ("alert", self.alerts),
+            ReferenceRecord: ("reference", self.references),
+            RecordedCommand: ("command", self.commands),
+        }
+        what, kept = kinds[type(event)]
+        self._take(what, event.seq if isinstance(event, RecordedCommand) else event.revision)
+        kept.append(event)
 
     def _take(self, what: str, revision: int) -> None:
         if self.fails in (what, "everything"):

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from benchmarks.scene import FPS, Ring
 from gripmon.daemon.config import Config
 from gripmon.daemon.running import run
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, State, StateRecord, Verdict
+from gripmon.model.outputs import Event, Notes, Output, Trace
+from gripmon.model.records import Frame, FrameRecord, State, Verdict
 from gripmon.monitor import Monitor, warm_up
 from gripmon.record.recorder import Recorder
 
@@ -92,27 +92,22 @@ class RingSource:
         return 1e-3 * (self.back_ns - self.handed_ns)
 
 
-class _TimedPublisher:
+class _TimedPublisher(Output):
     """Notes when a transform has left.  Its session outlives the loop, until the subscriber has been asked."""
 
-    def __init__(self, inner: Publisher, source: RingSource) -> None:
+    def __init__(self, inner: Output, source: RingSource) -> None:
         self._inner, self._source = inner, source
 
-    def transform(self, record: FrameRecord) -> None:
-        self._inner.transform(record)
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        self._inner.frame(frame, record, trace, notes)
         self._source.published_ns[record.seq] = time.monotonic_ns()
         self._source.measured[record.seq] = record.measured
         self._source.tracking[record.seq] = record.measured and record.state in _TRACKING
         self._source.valid[record.seq] = record.verdict is Verdict.VALID
 
-    def state(self, record: StateRecord) -> None:
-        self._inner.state(record)
+    def event(self, event: Event) -> None:
+        self._inner.event(event)
 
-    def alert(self, record: AlertRecord) -> None:
-        self._inner.alert(record)
-
-    def reference(self, record: ReferenceRecord) -> None:
-        self._inner.reference(record)
 
     def close(self) -> None: ...
 
@@ -158,14 +153,14 @@ def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
         publisher.close()
 
 
-def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder: Recorder | None = None) -> None:
+def run_loop(config: Config, source: RingSource, publisher: Output, recorder: Recorder | None = None) -> None:
     """The daemon's loop, as ``gripmon run`` runs it, until the source ends.  Closes the recorder, not the publisher."""
     settings = config.settings
     warm_up()
     run(
         Monitor(config.camera, config.gripper, settings.monitor, config.reference),
         source=source,
-        publisher=_TimedPublisher(publisher, source),
+        outputs=(_TimedPublisher(publisher, source),),
         recorder=Recorder() if recorder is None else recorder,
         settings=settings.daemon,
         robot=settings.robot,

@@ -94,7 +94,7 @@ def _push(
         stamp_ns = judged[0][0].stamp_ns + round(seq * 1e9 / scene.FPS)
         frame = Frame(seq, stamp_ns, frame.image, frame.jaw_opening_m)
         record = msgspec.structs.replace(record, seq=seq, stamp_ns=stamp_ns)
-        recorder.offer(frame, record, lambda trace=trace: trace)  # type: ignore[misc]
+        recorder.frame(frame, record, lambda trace=trace: trace)  # type: ignore[misc]
         if (seq + 1) % look_every == 0:
             pid = recorder.process_id
             looks.append(

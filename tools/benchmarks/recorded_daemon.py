@@ -14,19 +14,15 @@ import cv2
 
 from benchmarks import harness, scene
 from benchmarks.switched import SwitchedRecorder
-from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.model.outputs import Notes, Output, Trace
+from gripmon.model.records import Frame, FrameRecord
 
 
-class _Said:
-    """A publisher that writes to standard output."""
+class _Said(Output):
+    """An output that writes to standard output."""
 
-    def transform(self, record: FrameRecord) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         os.write(1, b"%d\n" % record.seq)
-
-    def state(self, record: StateRecord) -> None: ...
-    def alert(self, record: AlertRecord) -> None: ...
-    def reference(self, record: ReferenceRecord) -> None: ...
-    def close(self) -> None: ...
 
 
 def main(ring_path: str, directory: str, frames: str) -> None:

@@ -8,12 +8,13 @@ from typing import Any
 import msgspec
 
 from gripmon.daemon.config import Config
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
-from gripmon.record.recorder import Notes, Trace
+from gripmon.model.outputs import Event, Notes, Trace
+from gripmon.model.records import Frame, FrameRecord
+from gripmon.record.recorder import Recorder
 from gripmon.record.write import ProcessRecorder, open_recorder
 
 
-class SwitchedRecorder:
+class SwitchedRecorder(Recorder):
     """The product's recorder while ``on``, with its default settings but for ``changes``; idle while off."""
 
     def __init__(self, config: Config, directory: Path, **changes: Any) -> None:
@@ -56,22 +57,13 @@ class SwitchedRecorder:
     def failure(self) -> str | None:
         return self._inner.failure
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         if self.on:
             self._offered += 1
-            self._inner.offer(frame, record, trace, notes)
+            self._inner.frame(frame, record, trace, notes)
 
-    def alert(self, record: AlertRecord) -> None:
-        self._inner.alert(record)
-
-    def reference(self, record: ReferenceRecord) -> None:
-        self._inner.reference(record)
-
-    def command(self, command: RecordedCommand) -> None:
-        self._inner.command(command)
-
-    def state(self, state: StateRecord) -> None:
-        self._inner.state(state)
+    def event(self, event: Event) -> None:
+        self._inner.event(event)
 
     def close(self, timeout_s: float = 5.0) -> None:
         self._inner.close(timeout_s)

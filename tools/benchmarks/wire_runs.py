@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from benchmarks import harness, scene
 from benchmarks.wire_others import Crowd, RouterProcess, Staller, free_endpoint
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.model.outputs import Event, Notes, Output, Trace
+from gripmon.model.records import Frame, FrameRecord
 
 CONDITIONS = ("alone", "stopped", "blocked", "ten", "router")
 
@@ -45,7 +45,7 @@ class Plan:
 QUICK = Plan(ring=30, block=210, rounds=3, restarts=2, slow_s=8.0)
 
 
-class _Switched:
+class _Switched(Output):
     """The publisher of the moment; notes what the monitor needed for each frame, and counts exceptions."""
 
     def __init__(self, publishers: list[ZenohPublisher], count: int) -> None:
@@ -53,22 +53,16 @@ class _Switched:
         self.judged_us = np.full(count, np.nan)
         self.exceptions = 0
 
-    def transform(self, record: FrameRecord) -> None:
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         self.judged_us[record.seq] = 1e-3 * record.latency_ns
-        self._say(lambda to: to.transform(record))
+        self._say(lambda to: to.frame(frame, record, trace, notes))
 
-    def state(self, record: StateRecord) -> None:
-        self._say(lambda to: to.state(record))
-
-    def alert(self, record: AlertRecord) -> None:
-        self._say(lambda to: to.alert(record))
-
-    def reference(self, record: ReferenceRecord) -> None:
-        self._say(lambda to: to.reference(record))
+    def event(self, event: Event) -> None:
+        self._say(lambda to: to.event(event))
 
     def close(self) -> None: ...
 
-    def _say(self, what: Callable[[Publisher], None]) -> None:
+    def _say(self, what: Callable[[Output], None]) -> None:
         try:
             what(self.publishers[self.current])
         except Exception:

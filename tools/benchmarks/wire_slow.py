@@ -19,7 +19,7 @@ from benchmarks.wire_others import RouterProcess, free_endpoint
 from gripmon.client import Policy, TransformClient
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
+from gripmon.model.records import CornerRecord, Drift, Frame, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 
 RATES_BYTES_PER_S = (100e3, 70e3, 30e3)
 _FPS = 30.0
@@ -51,7 +51,8 @@ class _Camera:
     def _run(self) -> None:
         seq, start_s = 0, time.monotonic()
         while not self._done.wait(max(0.0, start_s + seq / _FPS - time.monotonic())):
-            self._publisher.transform(msgspec.structs.replace(_RECORD, seq=seq, stamp_ns=time.time_ns()))
+            record = msgspec.structs.replace(_RECORD, seq=seq, stamp_ns=time.time_ns())
+            self._publisher.frame(Frame(seq, record.stamp_ns, None), record, lambda: None)
             seq += 1
 
 

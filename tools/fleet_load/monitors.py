@@ -22,6 +22,7 @@ from gripmon.model.records import (
     AlertKind,
     AlertRecord,
     Cause,
+    Frame,
     FrameRecord,
     ReferenceRecord,
     Severity,
@@ -47,12 +48,13 @@ class Monitor:
 
     def transform(self) -> None:
         seq = self.sent["transform"]
-        self.publisher.transform(msgspec.structs.replace(self._record, seq=seq, stamp_ns=time.time_ns()))
+        record = msgspec.structs.replace(self._record, seq=seq, stamp_ns=time.time_ns())
+        self.publisher.frame(Frame(seq, record.stamp_ns, None), record, lambda: None)
         self.sent["transform"] += 1
 
     def state(self, rate_hz: float) -> None:
         frames = self.sent["transform"]
-        self.publisher.state(
+        self.publisher.event(
             StateRecord(
                 robot=self.robot,
                 camera=_CAMERA,
@@ -78,7 +80,7 @@ class Monitor:
     def alert(self) -> None:
         text = "the camera has moved by 1.50 mm and 0.10°; cause not known yet"
         alert = Alert(AlertKind.STEP, Cause.UNKNOWN, Severity.WARNING, text)
-        self.publisher.alert(
+        self.publisher.event(
             AlertRecord(
                 robot=self.robot,
                 camera=_CAMERA,
@@ -96,7 +98,7 @@ class Monitor:
         transform = self._record.cam_T_grip
         assert transform is not None
         covariance = self._record.covariance or (0.0,) * 36
-        self.publisher.reference(
+        self.publisher.event(
             ReferenceRecord("configuration", 0, time.time_ns(), "configuration", transform, covariance)
         )
         self.sent["reference"] += 1

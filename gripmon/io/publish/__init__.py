@@ -13,24 +13,3 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 Late joiners get the last one in two ways: by a plain ``get`` on the key (answered by a queryable), and by an advanced
 subscriber with history (``zenoh.ext``).
 """
-
-from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
-
-
-class Publisher:
-    """A loop's output; no method waits for the network.  This base class publishes nothing."""
-
-    def transform(self, record: FrameRecord) -> None:
-        """One frame's record."""
-
-    def reference(self, record: ReferenceRecord) -> None:
-        """The reference that is in force from now on."""
-
-    def state(self, record: StateRecord) -> None:
-        """The newest state."""
-
-    def alert(self, record: AlertRecord) -> None:
-        """An alert, with or without a frame."""
-
-    def close(self) -> None:
-        """Release all resources.  Calling it twice does nothing more."""

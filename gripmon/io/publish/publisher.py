@@ -1,31 +1,28 @@
-"""A monitor's messages on the network, and several publishers in place of one."""
+"""A monitor's messages on the network."""
 
 from __future__ import annotations
 
-import logging
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TypeVar
 
 import msgspec
 import zenoh
 
-from gripmon.io.publish import Publisher
 from gripmon.io.publish.presence import Answers, Presence
 from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, in_zenohs_thread, steady_ns
-from gripmon.model.errors import one_line
+from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import (
     AlertRecord,
     ClockReading,
+    Frame,
     FrameRecord,
     ReferenceRecord,
     StateRecord,
     to_json,
 )
-
-_log = logging.getLogger(__name__)
 
 _T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -33,8 +30,15 @@ _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no
 _HEARTBEAT_S = 1.0
 
 
-class _ZenohStates(Publisher):
-    """Common part of all publishers on a link: states, alerts, and the records that wait for the link to open."""
+class ZenohPublisher(Output):
+    """Publishes one monitor's records over a link, which it closes in the end.
+
+    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
+    and the last few alerts are kept for its opening.
+    """
+
+    name = "Zenoh"
+    public = True
 
     def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
         """``presence`` has the id for every message.  Raises ValueError for a name that can't be part of a key."""
@@ -45,23 +49,29 @@ class _ZenohStates(Publisher):
         self._wire: _Wire | None = None
         self._lock = threading.Lock()  # guards the kept records below against the opening thread
         self._last: dict[str, bytes] = {}  # by key, of what late joiners get
-        self._waiting: dict[str, deque[bytes]] = {}
+        self._waiting: deque[bytes] = deque(maxlen=_ALERTS_KEPT)
         link.attach(self._adopt, self._leave)
 
-    def state(self, record: StateRecord) -> None:
-        """Send the state, and keep it for late joiners."""
-        self._put_last("state", to_json(self._signed(record)))
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """Send one frame's record."""
+        wire = self._wire
+        if wire is None:
+            self.unsent += 1
+        else:
+            wire.puts["transform"](to_json(self._signed(record)))
 
-    def alert(self, record: AlertRecord) -> None:
-        """Send an alert."""
-        self._put_each("alert", to_json(self._signed(record)))
+    def event(self, event: Event) -> None:
+        """Send a reference or a state, and keep it for late joiners; send an alert."""
+        if isinstance(event, AlertRecord):
+            self._put_alert(to_json(self._signed(event)))
+        elif isinstance(event, StateRecord):
+            self._put_last("state", to_json(self._signed(event)))
+        elif isinstance(event, ReferenceRecord):
+            self._put_last("reference", to_json(event))
 
     def close(self) -> None:
         """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
         self._link.close()
-
-    def _declared(self, wire: _Wire) -> None:
-        """Declare the subclass's own keys."""
 
     def _signed(self, record: _T) -> _T:
         """The record with the id of this start."""
@@ -73,55 +83,29 @@ class _ZenohStates(Publisher):
             if self._wire is not None:
                 self._wire.puts[leaf](payload)
 
-    def _put_each(self, leaf: str, payload: bytes) -> None:
+    def _put_alert(self, payload: bytes) -> None:
         with self._lock:
             if self._wire is not None:
-                self._wire.puts[leaf](payload)
+                self._wire.puts["alert"](payload)
             else:
-                self._waiting.setdefault(leaf, deque(maxlen=_ALERTS_KEPT)).append(payload)
+                self._waiting.append(payload)
 
     def _adopt(self, session: zenoh.Session) -> None:
         """Declare everything on a new session and send what was kept for it."""
         wire = _Wire(session, self.keys, self.monitor_id)
-        self._declared(wire)
         wire.appear()
         with self._lock:
             self._wire = wire
             for leaf in sorted(self._last):  # a reference before the state that names it
                 wire.puts[leaf](self._last[leaf])
-            for leaf, payloads in self._waiting.items():
-                while payloads:
-                    wire.puts[leaf](payloads.popleft())
+            while self._waiting:
+                wire.puts["alert"](self._waiting.popleft())
 
     def _leave(self) -> None:
         with self._lock:
             wire, self._wire = self._wire, None
         if wire is not None:
             wire.close()
-
-
-class ZenohPublisher(_ZenohStates):
-    """Publishes one monitor's records over a link, which it closes in the end.
-
-    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
-    and the last few alerts are kept for its opening.
-    """
-
-    def transform(self, record: FrameRecord) -> None:
-        """Send one frame's record."""
-        wire = self._wire
-        if wire is None:
-            self.unsent += 1
-        else:
-            wire.puts["transform"](to_json(self._signed(record)))
-
-    def reference(self, record: ReferenceRecord) -> None:
-        """Send the reference, and keep it for late joiners."""
-        self._put_last("reference", to_json(record))
-
-    def _declared(self, wire: _Wire) -> None:
-        wire.declare_newest("transform")
-        wire.declare_kept("reference")
 
 
 def _keeping_publisher(
@@ -209,7 +193,9 @@ class _Wire:
         self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
-        self.declare_kept("state")
+        self.declare_newest("transform")
+        for leaf in ("reference", "state"):
+            self.declare_kept(leaf)
         self._alive: list[zenoh.LivelinessToken] = []
 
     def declare_newest(self, leaf: str) -> None:
@@ -236,60 +222,3 @@ class _Wire:
         for token in reversed(self._alive):
             token.undeclare()
         self._answers.close()
-
-
-class Publishers(Publisher):
-    """Passes each record to the first publisher and then to those of the others that take such records.
-
-    An exception of the first is raised, after the others got the record.  An exception of another one never reaches the
-    caller: it is logged once, until it changes, and :meth:`fault` reports it.
-    """
-
-    def __init__(self, first: Publisher, others: Mapping[str, Publisher]) -> None:
-        """``others`` by their names in messages."""
-        self._first, self._others = first, others
-        self._faults: dict[tuple[str, str], str] = {}  # by publisher and method, of which one may work and one not
-
-    def transform(self, record: FrameRecord) -> None:
-        self._hand("transform", record)
-
-    def reference(self, record: ReferenceRecord) -> None:
-        self._hand("reference", record)
-
-    def state(self, record: StateRecord) -> None:
-        self._hand("state", record)
-
-    def alert(self, record: AlertRecord) -> None:
-        self._hand("alert", record)
-
-    def close(self) -> None:
-        """Close all, the first last."""
-        for name in self._others:
-            self._hand_other(name, "close")
-        self._first.close()
-
-    def fault(self) -> str:
-        """What is wrong with the others, in a few words for a person; empty if nothing is."""
-        return "; ".join(dict.fromkeys(self._faults.values()))
-
-    def _hand(self, what: str, record: object) -> None:
-        try:
-            getattr(self._first, what)(record)
-        finally:
-            for name in self._others:
-                self._hand_other(name, what, record)
-
-    def _hand_other(self, name: str, what: str, *values: object) -> None:
-        put = getattr(self._others[name], what, None)
-        if put is None:
-            return
-        try:
-            put(*values)
-        except Exception as error:  # noqa: BLE001  logged here, and reported in the state
-            text = f"{name} fails: {one_line(error)}"
-            if self._faults.get((name, what)) != text:
-                _log.error("%s", text)
-                _log.debug("%s", name, exc_info=error)
-            self._faults[name, what] = text
-        else:
-            self._faults.pop((name, what), None)

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gripmon.io.publish import Publisher
 from gripmon.io.ros2.names import Layout, Qos, Ros2Settings
 from gripmon.io.ros2.node import DIAGNOSTICS, POSE, TF, Node, TopicPublisher, prepare, typestore
 from gripmon.io.wire import Link
 from gripmon.model.geometry import from_record, inverse_jacobian, invert, to_record
+from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
     Array,
+    Frame,
     FrameRecord,
     Severity,
     StandingAlert,
@@ -198,7 +199,7 @@ class _Topics:
     diagnostics: TopicPublisher
 
 
-class Ros2Publisher(Publisher):
+class Ros2Publisher(Output):
     """Publishes one monitor's records as a node on a link that it doesn't own.
 
     Transforms with an allowed verdict go to tf and to the pose topic, stamped with the frame's capture time, except
@@ -220,7 +221,10 @@ class Ros2Publisher(Publisher):
         self._alerts: dict[str, StandingAlert] = {}  # those that are open
         link.attach(self._adopt, self._leave)
 
-    def transform(self, record: FrameRecord) -> None:
+    name = "ROS 2"
+    public = True
+
+    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Publish one frame's transform, if it has one and its verdict allows it."""
         self._frame = record
         topics = self._ready()
@@ -232,13 +236,19 @@ class Ros2Publisher(Publisher):
         topics.tf.put(self._messages.tf(header, transform))
         topics.pose.put(self._messages.pose(header, transform, covariance))
 
-    def state(self, record: StateRecord) -> None:
-        """Publish diagnostics."""
+    def event(self, event: Event) -> None:
+        """Publish diagnostics with a state, and with an alert."""
+        if isinstance(event, StateRecord):
+            self._of_state(event)
+        elif isinstance(event, AlertRecord):
+            self._of_alert(event)
+
+    def _of_state(self, record: StateRecord) -> None:
         self._state = record
         self._alerts = {alert.alert_id: alert for alert in record.open_alerts}
         self._diagnose()
 
-    def alert(self, record: AlertRecord) -> None:
+    def _of_alert(self, record: AlertRecord) -> None:
         """Publish diagnostics if the alert lasts, or has lasted."""
         if record.event is AlertEvent.NOTED:
             return
