@@ -259,6 +259,23 @@ def test_without_a_feed_the_frames_opening_stays():
     assert bench.network.transforms[0].jaw_opening_m == 0.03
 
 
+def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing(monkeypatch: pytest.MonkeyPatch):
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w") as pipe, os.fdopen(reader, "rb", buffering=0) as read:
+        monkeypatch.setattr(sys, "stderr", pipe)
+        log_to_stderr()
+        log = logging.getLogger("gripmon.test")
+        for number in range(5000):  # 64 KiB are taken
+            log.info("line %d", number)
+        taken = read.read(1 << 20).decode().splitlines()
+        log.info("the last one")
+        said = read.read(1 << 20).decode().splitlines()
+        logging.getLogger("gripmon").handlers.clear()
+    assert [line.split("line ")[1] for line in taken] == [str(k) for k in range(len(taken))] and len(taken) < 5000
+    assert said[0].endswith(f"{5000 - len(taken)} lines of this log are missing: nobody read it")
+    assert said[1].endswith("the last one")
+
+
 def write(estimates: EstimatesFile, seq: int) -> None:
     estimates.frame(Frame(seq, 1, None), frame_record(seq), lambda: None)
 

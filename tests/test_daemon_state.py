@@ -286,6 +286,24 @@ def test_a_chain_that_cannot_be_kept_is_not_tried_again():
     keeper.close()
 
 
+def test_a_disk_that_hangs_delays_a_reference_and_no_frame():
+    """It isn't in force before it is on the disk; what the disk gets too late doesn't stay there."""
+    disk, known = Disk(), MonitorState((reference_record(1),))
+    keeper = StateKeeper(disk)
+    keeper.now(known)
+    disk.slow = threading.Event()
+    longer = (*known.references, reference_record(2))
+    started_s = time.monotonic()
+    assert keeper.references(longer) == "state not kept: the disk doesn't answer"
+    assert time.monotonic() - started_s < 10.0 and keeper.failure
+    disk.slow.set()
+    wait_until(lambda: len(disk.states) == 3, "what was known")
+    assert revisions(disk) == [1, 2, 1] and not keeper.failure
+    assert keeper.references(longer) == ""
+    assert revisions(disk) == [1, 2, 1, 2]
+    keeper.close()
+
+
 def test_an_asker_who_is_gone_disturbs_nobody():
     bench = Bench(range(3))
     asker = Asker([UNDO])

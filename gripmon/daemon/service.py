@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import os
+import select
 import socket
 import sys
+from typing import TextIO
 
 import msgspec
 
@@ -31,12 +33,38 @@ def log_to_stderr(*, verbose: bool = False, as_json: bool = False) -> None:
     """Let the ``gripmon`` loggers write lines to stderr, as text or ``as_json``; ``verbose`` adds tracebacks of
     recovered errors.
     """
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _Unhurried(sys.stderr)
     handler.setFormatter(JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger = logging.getLogger("gripmon")
     logger.handlers = [handler]
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)
     logger.propagate = False
+
+
+class _Unhurried(logging.StreamHandler[TextIO]):
+    """Writes where somebody reads: a stopped terminal or pager must not stop the loop.  Lines for which there is no
+    room are counted, and how many were lost is the first line when there is.
+    """
+
+    _lost = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record if that doesn't wait."""
+        if not self._has_room():
+            self._lost += 1
+            return
+        if self._lost:
+            lost, self._lost = self._lost, 0
+            text = f"{lost} lines of this log are missing: nobody read it"
+            super().emit(logging.LogRecord(record.name, logging.WARNING, __file__, 0, text, (), None))
+        super().emit(record)
+
+    def _has_room(self) -> bool:
+        """Whether a line can be written without waiting, for pipes, sockets and terminals."""
+        try:
+            return bool(select.select((), (self.stream,), (), 0.0)[1])
+        except (OSError, ValueError):  # not a file: there is always room
+            return True
 
 
 class ServiceManager:
