@@ -391,3 +391,12 @@ def test_a_second_cameras_configuration_is_told_what_to_use_now(tmp_path: Path):
     path.write_text("robot: arm1\ncamera_name: second\nlaser: {calibration: laser.yaml}\n")
     with pytest.raises(ConfigError, match=r"laser: .* watched by the daemon any more; gripmon check --laser"):
         load_config(path)
+
+
+@pytest.mark.parametrize("key", ["camera", "gripper", "reference"])
+def test_a_file_name_that_is_too_long_is_one_line(tmp_path: Path, key: str):
+    path = tmp_path / "arm.yaml"
+    values = yaml.safe_load(builtin_config("demo.yaml").read_text()) | {key: "x" * 256 + ".yaml"}
+    path.write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match=rf"{key}: x{{40}}… can't be a file \(File name too long\); "):
+        load_config(path)

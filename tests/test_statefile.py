@@ -308,6 +308,23 @@ def test_two_monitors_can_not_use_one_file(path: Path):
     read_once(path)
 
 
+def test_a_lock_file_that_somebody_deletes_is_made_again(path: Path):
+    file = opened(path)
+    assert file.write(STATE)
+    lock = path.with_name(path.name + ".lock")
+    note = lock.read_bytes()
+    path.unlink()
+    lock.unlink()
+    assert file.write(STATE) and lock.read_bytes() == note
+    with pytest.raises(StateFileError, match="is in use by process"):
+        opened(path)
+    lock.unlink()
+    other = opened(path)  # while there was none
+    assert not file.write(STATE) and "is in use by process" in file.failure
+    file.close()
+    other.close()
+
+
 def test_the_lock_goes_with_its_process(path: Path):
     code = (
         "import sys; from pathlib import Path; sys.path[:0] = sys.argv[2:]\n"

@@ -199,11 +199,16 @@ class StateFile:
         if not self._usable:
             return False
         try:
+            self._lock_again_if_gone()
             data = pack(self._owner, state)
             # A state that can't be read back must not replace one that can: NaN, for example, is null in JSON.
             if unpack(data).state != state:
                 raise ValueError("it is not what comes back")
             write_atomically(self._path, data)
+        except StateFileError as error:
+            self._usable = False
+            self._fail(str(error))
+            return False
         except OSError as error:
             self._fail(f"{self._path} can't be written: {error.strerror or error}")
             return False
@@ -247,6 +252,18 @@ class StateFile:
             self._give_up(f"{path} can't be locked: {error.strerror or error}")
             return None
         return descriptor
+
+    def _lock_again_if_gone(self) -> None:
+        """Make the lock file again where somebody has deleted it: a second process would get its lock."""
+        held = self._lock
+        if held is None or os.fstat(held).st_nlink > 0:
+            return
+        newest = self._newest_revision
+        self._lock = self._take_lock()
+        self._newest_revision = newest
+        if self._lock is not None:
+            self._note(self._lock)
+        os.close(held)
 
     def _note(self, descriptor: int) -> None:
         """Write the process and the newest revision into the lock file: a damaged state can't tell the revision."""

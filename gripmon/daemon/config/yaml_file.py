@@ -101,9 +101,12 @@ def read_configuration(path: Path) -> dict[str, Any]:
 
 def named_file(path: Path, key: str, name: str, what: str, instead: str = "") -> Path:
     """A file that a configuration names, ``what`` there would be right.  :class:`ConfigError` if there is none."""
-    there = path.parent / name
-    if not there.is_file():
-        right = f"{what}, its path relative to this file{instead}"
+    there, right = path.parent / name, f"{what}, its path relative to this file{instead}"
+    try:
+        found = there.is_file()
+    except OSError as error:  # a name that is too long
+        raise ConfigError(path, key, f"{name[:40]}… can't be a file ({error.strerror})", right) from None
+    if not found:
         raise ConfigError(path, key, f"there is no file {there}", right)
     return there
 
