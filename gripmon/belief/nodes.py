@@ -228,7 +228,8 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
 @compiled
 def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes: Array) -> None:
     """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
-    fingers were longer or shorter by one length, each but for an edge's width.
+    fingers were longer or shorter by one length; half of such things lie flush with the fingers, as jaws and tables
+    align them, so that each is found there exactly, of others but for an edge's width.
     """
     near, missed, share, across = sizes[0], sizes[2], sizes[3], sizes[4]
     before = bank.doubts[nodes.parent[i]]
@@ -239,7 +240,8 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
             of_ends = of_ends or (table.ends[finger] >> k) & 1 == 1
         if not of_ends:
             continue
-        log, apart, cross, along, rows, fresh = 0.0, 0.0, 0.0, 0.0, 0, (before >> k) & 1 == 0
+        log, cross, along = np.zeros(2), np.zeros(2), np.zeros(2)  # flush, and but for an edge's width
+        apart, rows, fresh = 0.0, 0, (before >> k) & 1 == 0
         for edge in range(len(seen.found)):
             if not ((table.edges[k] >> edge) & 1 and seen.found[edge] > 0):
                 continue
@@ -249,17 +251,21 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
             for row in range(2):
                 way = seen.rows[edge, of, row, _FIRST] + seen.rows[edge, of, row, _FIRST + 1]
                 missing = seen.lines[edge, of, row] - nodes.at[i, edge, row]
-                variance = near + nodes.wide[i, edge, row] + strength_of(seen, edge, row) + seen.white[edge, of, row]
-                log += normal(missing, variance)
-                cross += way * missing / variance
-                along += way * way / variance
+                variance = nodes.wide[i, edge, row] + strength_of(seen, edge, row) + seen.white[edge, of, row]
+                for kind in range(2):
+                    log[kind] += normal(missing, variance)
+                    cross[kind] += way * missing / variance
+                    along[kind] += way * way / variance
+                    variance += near
                 rows += 1
-        if rows < 4 or along == 0.0:
-            continue
-        log += 0.5 * (across * cross * cross / (1.0 + across * along) - math.log(1.0 + across * along))
         share_now = share if fresh else missed * share
-        if share_now > 0.0:
-            nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + log - apart)
+        if rows == 0 or along[0] == 0.0 or share_now == 0.0:
+            continue
+        for kind in range(2):
+            free = 1.0 + across * along[kind]
+            log[kind] += 0.5 * (across * cross[kind] * cross[kind] / free - math.log(free)) - math.log(2.0)
+        together = log_sum(log[0], log[1])
+        nodes.across[i, k] = log_sum(math.log(1.0 - share_now), math.log(share_now) + together - apart)
 
 
 @compiled

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gripmon.belief.state import FAR, FOREIGN_KINDS, LIGHT, NEAR, SIZE, STILL, Bank, Seen
+from gripmon.belief.state import FAR, FOREIGN_KINDS, LIGHT, MEMORIES, NEAR, SIZE, STILL, Bank, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -239,23 +239,71 @@ def not_drawn(bank: Bank, h: int, edge: int) -> bool:
 
 
 @compiled
+def things_seen(bank: Bank, h: int, edge: int, kind: int) -> int:
+    """How many things are remembered that the search found for another thing's edge."""
+    known = 0
+    while known < MEMORIES and bank.place_spread[h, edge, FOREIGN_KINDS * known + kind, 0, 0] > 0.0:
+        known += 1
+    return known
+
+
+@compiled
+def stayed(
+    bank: Bank, h: int, seen: Seen, edge: int, row: int, slot: int, stays: float, size: float, place: Array,
+    spread: Array,
+) -> None:  # fmt: skip
+    """Where one row of a remembered thing is now: ``place`` (2,) with ``spread`` (3,).  Of those but the last one seen
+    the background counts as new.
+    """
+    like = 0.0 if slot >= FOREIGN_KINDS else seen.likeness[edge] if seen.found[edge] > 0 else 1.0
+    was = bank.place_spread[h, edge, slot, row]
+    place[0] = stays * bank.place[h, edge, slot, row, 0]
+    place[1] = like * bank.place[h, edge, slot, row, 1]
+    spread[0] = stays * stays * was[0] + (1.0 - stays * stays) * size
+    spread[1] = stays * like * was[1]
+    spread[2] = like * like * was[2] + (1.0 - like * like) * strength_of(seen, edge, row)
+
+
+@compiled
+def remember(
+    bank: Bank, h: int, seen: Seen, edge: int, kind: int, way: int, of: int, place: Array, spread: Array
+) -> None:  # fmt: skip
+    """What was seen last comes first: the thing ``way`` of those known, or with a line ``of`` a new one, in place of
+    what wasn't seen for longest where there are too many.
+    """
+    searched = np.empty(2)
+    for row in range(2):
+        if of >= 0:
+            searched[row] = seen.image[edge, of, row] - seen.lines[edge, of, row] + seen.searched[edge, of, row]
+        else:
+            searched[row] = bank.searched[h, edge, FOREIGN_KINDS * way + kind, row]
+    for m in range(min(way, MEMORIES - 1), 0, -1):
+        slot, newer = FOREIGN_KINDS * m + kind, FOREIGN_KINDS * (m - 1) + kind
+        bank.searched[h, edge, slot] = bank.searched[h, edge, newer]
+        bank.place[h, edge, slot] = bank.place[h, edge, newer]
+        bank.place_spread[h, edge, slot] = bank.place_spread[h, edge, newer]
+    bank.searched[h, edge, kind], bank.place[h, edge, kind] = searched, place
+    bank.place_spread[h, edge, kind] = spread
+
+
+@compiled
 def foreign(
     bank: Bank, h: int, seen: Seen, edge: int, fresh: bool, held: bool, sizes: Array, at: Array, wide: Array,
     near: bool, keep: bool,
 ) -> float:  # fmt: skip
     """Log likelihood of an edge that is another thing's, by ``sizes`` (3,): variances of near and far, px^2, and the
-    probability that the search finds another line of that thing than before, or that it has moved.
+    probability that the search finds a line that it hasn't found before, or that the thing has moved.
 
     It lies near where the gripper's own is expected, ``at`` (2,) with variance ``wide`` (2,), or anywhere around where
     it was searched, is any of the lines there, and stays there while the picture does; ``held`` moves with the gripper
-    and stays in any case.  ``fresh``: the doubt begins; of one that begins while nothing is shown the place is drawn
-    when something is.  ``near``: it may be near.  ``keep``: it is learnt, and what wasn't shown fades.
+    and stays in any case.  Where another place was searched another line is found: several are remembered, and half of
+    the frames show the last one.  ``fresh``: the doubt begins; of one that begins while nothing is shown the place is
+    drawn when something is.  ``near``: it may be near.  ``keep``: it is learnt, and what wasn't shown fades.
     """
     count = seen.found[edge]
-    if count == 0 and fresh:
-        for kind in range(FOREIGN_KINDS if keep else 0):
-            bank.place_spread[h, edge, kind, :, :] = 0.0
-        return 0.0
+    if fresh and keep:
+        for slot in range(FOREIGN_KINDS * MEMORIES):
+            bank.place_spread[h, edge, slot, :, :] = 0.0
     fresh = fresh or not_drawn(bank, h, edge)
     if count == 0 and fresh:
         return 0.0
@@ -265,24 +313,21 @@ def foreign(
     logs, place, spread = np.empty(FOREIGN_KINDS), np.zeros((2, 2)), np.zeros((2, 3))
     best, best_spread = np.zeros((2, 2)), np.zeros((2, 3))
     for kind in range(FOREIGN_KINDS):
-        most, total = -math.inf, -math.inf
-        drawn_at = -1
-        for way in range(2):  # it stays, or is drawn
-            share = math.log(max(another if way == 1 else 1.0 - another, 1e-300))
+        most, total, best_way, best_line = -math.inf, -math.inf, 0, 0
+        known = 0 if fresh else things_seen(bank, h, edge, kind)
+        for way in range(known + 1):  # a thing that was seen, the last one first, or one that wasn't
+            part = 1.0 if known == 1 else 0.5 if way == 0 else 0.5 / max(known - 1, 1)
+            share = math.log(max(another if way == known else (1.0 - another) * part, 1e-300)) - math.log(max(count, 1))
             for of in range(max(count, 1)):
-                log = share - math.log(max(count, 1))
+                log = share
                 for row in range(2):
                     missing, white, own = 0.0, seen.white[edge, of, row], seen.white[edge, of, row]
-                    if way == 0:
+                    if way < known:
+                        slot = FOREIGN_KINDS * way + kind
                         white = seen.image_white[edge, of, row]
                         if count > 0:
-                            missing = seen.image[edge, of, row] - bank.searched[h, edge, kind, row]
-                        was = bank.place_spread[h, edge, kind, row]
-                        place[row, 0] = stays * bank.place[h, edge, kind, row, 0]
-                        place[row, 1] = like * bank.place[h, edge, kind, row, 1]
-                        spread[row, 0] = stays * stays * was[0] + (1.0 - stays * stays) * sizes[kind]
-                        spread[row, 1] = stays * like * was[1]
-                        spread[row, 2] = like * like * was[2] + (1.0 - like * like) * strength_of(seen, edge, row)
+                            missing = seen.image[edge, of, row] - bank.searched[h, edge, slot, row]
+                        stayed(bank, h, seen, edge, row, slot, stays, sizes[kind], place[row], spread[row])
                     else:
                         missing = seen.lines[edge, of, row] - seen.searched[edge, of, row]
                         place[row, 0], place[row, 1] = 0.0, 0.0
@@ -294,17 +339,12 @@ def foreign(
                         log += drawn(place[row], spread[row], missing, white, own)
                 total = log if total == -math.inf else log_sum(total, log)
                 if log > most:
-                    most, drawn_at = log, of if way == 1 else -1
+                    most, best_way, best_line = log, way, of
                     best[:, :], best_spread[:, :] = place, spread
         logs[kind] = (-math.log(2.0) if fresh else bank.kind[h, edge, kind]) + total
-        for row in range(2 if keep else 0):
-            if drawn_at >= 0:
-                beside = seen.lines[edge, drawn_at, row] - seen.searched[edge, drawn_at, row]
-                bank.searched[h, edge, kind, row] = seen.image[edge, drawn_at, row] - beside
-            for k in range(2):
-                bank.place[h, edge, kind, row, k] = best[row, k]
-            for k in range(3):
-                bank.place_spread[h, edge, kind, row, k] = best_spread[row, k]
+        if keep:
+            line = best_line if best_way == known and count > 0 else -1
+            remember(bank, h, seen, edge, kind, best_way, line, best, best_spread)
     total = log_sum(logs[NEAR], logs[FAR]) if near else logs[FAR]
     if keep:
         for kind in range(FOREIGN_KINDS):

@@ -39,6 +39,8 @@ FOCAL = 22
 
 NEAR, FAR = 0, 1
 FOREIGN_KINDS = 2
+MEMORIES = 4
+"""Things remembered of a doubted edge: as many places are searched, the fit's and the three heaviest."""
 STILL = 0.99
 """Likeness of two pictures from which on the background counts as the same one."""
 LATELY_S = 0.19
@@ -105,8 +107,9 @@ class Bank(NamedTuple):
     """h hypotheses of e edges (2 e rows), k - 1 remembered backgrounds: ``log_weight`` (h,), ``doubts`` (h,) as bits;
     ``mean`` (h, 23) and ``covariance`` (h, 23, 23) of g; each row's u given g: ``offset`` a (h, 2 e, k), ``slope`` A
     (h, 2 e, k, 23), ``spread`` C (h, 2 e, k, k), px.  Of doubted edges by kind (near, far) its log share ``kind`` (h,
-    e, 2), where each row was ``searched`` (h, e, 2, 2), px, when its place was drawn, and the ``place`` (h, e, 2, 2, 2)
-    beside that (place, background) with variances and covariance ``place_spread`` (h, e, 2, 2, 3).
+    e, 2), and of the things seen there, the last first and of each kind in turn: where each row was ``searched``
+    (h, e, 8, 2), px, when its place was drawn, and the ``place`` (h, e, 8, 2, 2) beside that (place, background) with
+    variances and covariance ``place_spread`` (h, e, 8, 2, 3).
     """
 
     log_weight: Array
@@ -124,11 +127,11 @@ class Bank(NamedTuple):
     @classmethod
     def empty(cls, hypotheses: int, edges: int, backgrounds: int) -> Bank:
         """Zeros."""
-        h, e, k = hypotheses, edges, 1 + backgrounds
+        h, e, k, m = hypotheses, edges, 1 + backgrounds, FOREIGN_KINDS * MEMORIES
         return cls(
             np.zeros(h), np.zeros(h, np.int64), np.zeros((h, SIZE)), np.zeros((h, SIZE, SIZE)),
             np.zeros((h, 2 * e, k)), np.zeros((h, 2 * e, k, SIZE)), np.zeros((h, 2 * e, k, k)),
-            np.zeros((h, e, 2, 2)), np.zeros((h, e, 2)), np.zeros((h, e, 2, 2, 2)), np.zeros((h, e, 2, 2, 3)),
+            np.zeros((h, e, m, 2)), np.zeros((h, e, 2)), np.zeros((h, e, m, 2, 2)), np.zeros((h, e, m, 2, 3)),
         )  # fmt: skip
 
 
