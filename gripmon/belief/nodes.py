@@ -204,12 +204,14 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
     variances ``spreads`` (l, 2), and the log probability of that; or that of its being none of them, with what these
     say as anything's.
 
-    Where it is known to less than lines lie apart, the fit chooses, as for all edges together.
+    Where it is known to less than lines lie apart, the fit chooses, as for all edges together.  Where no search reached
+    the place, its own line can't be among those found.
     """
-    count, far, missed = seen.found[edge], sizes[1], sizes[2]
+    count, far, missed, reached = seen.found[edge], sizes[1], sizes[2], False
     log, any_of, best, most = -math.log(count), 0.0, -1, -math.inf
     for of in range(count):
         near, anything = 0.0, 0.0
+        reached = reached or (places[of, 0] - seen.searched[edge, of, 0]) ** 2 <= far
         for row in range(2):
             value, white = seen.lines[edge, of, row], seen.white[edge, of, row]
             near += normal(value - places[of, row], spreads[of, row] + white)
@@ -220,6 +222,8 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
     none, apart = math.log(missed) + math.log(any_of) if missed > 0.0 else -math.inf, spreads[0, 0] > APART_PX**2
     if apart and seen.fitted[edge] >= 0:
         return seen.fitted[edge], math.log(1.0 - missed) + log
+    if not (reached or apart) and missed > 0.0:
+        return -1, math.log(any_of)
     if missed > 0.0 and (apart or math.log(1.0 - missed) + log + most < none):
         return -1, none
     return best, math.log(1.0 - missed) + log

@@ -265,6 +265,20 @@ def stayed(
 
 
 @compiled
+def reached(bank: Bank, h: int, seen: Seen, edge: int, kind: int, known: int, stays: float, reach: float) -> bool:
+    """Whether anything that is remembered of an edge lies within the ``reach`` (a variance, px^2) of a search that
+    found something: of what wasn't looked at nothing is found.
+    """
+    for way in range(known):
+        slot = FOREIGN_KINDS * way + kind
+        for of in range(seen.found[edge]):
+            centre = seen.image[edge, of, 0] - seen.lines[edge, of, 0] + seen.searched[edge, of, 0]
+            if (centre - bank.searched[h, edge, slot, 0] - stays * bank.place[h, edge, slot, 0, 0]) ** 2 <= reach:
+                return True
+    return False
+
+
+@compiled
 def remember(
     bank: Bank, h: int, seen: Seen, edge: int, kind: int, way: int, of: int, place: Array, spread: Array
 ) -> None:  # fmt: skip
@@ -309,12 +323,14 @@ def foreign(
         return 0.0
     like = seen.likeness[edge] if count > 0 else 1.0
     stays = 1.0 if held or like >= STILL else like
-    another = 1.0 if fresh else sizes[2] if count > 0 else 0.0
     logs, place, spread = np.empty(FOREIGN_KINDS), np.zeros((2, 2)), np.zeros((2, 3))
     best, best_spread = np.zeros((2, 2)), np.zeros((2, 3))
     for kind in range(FOREIGN_KINDS):
         most, total, best_way, best_line = -math.inf, -math.inf, 0, 0
         known = 0 if fresh else things_seen(bank, h, edge, kind)
+        another = 1.0 if fresh else sizes[2] if count > 0 else 0.0
+        if another > 0.0 and not reached(bank, h, seen, edge, kind, known, stays, sizes[FAR]):
+            another = 1.0
         for way in range(known + 1):  # a thing that was seen, the last one first, or one that wasn't
             part = 1.0 if known == 1 else 0.5 if way == 0 else 0.5 / max(known - 1, 1)
             share = math.log(max(another if way == known else (1.0 - another) * part, 1e-300)) - math.log(max(count, 1))
