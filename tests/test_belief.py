@@ -14,9 +14,9 @@ from support.belief_paths import sum_of_paths
 from gripmon.belief import bound
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import Doubt, Rates, Table, Told, log_told, of_edges, of_ends, of_mount
-from gripmon.belief.nodes import prepare
-from gripmon.belief.rows import fade
-from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
+from gripmon.belief.nodes import prepare, which
+from gripmon.belief.rows import fade, foreign
+from gripmon.belief.state import LATELY, MOTION, SIZE, Bank, Priors, Seen
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
@@ -292,6 +292,55 @@ def test_a_picture_that_stays_tells_no_more_with_every_frame() -> None:
         belief.update(frame.seen, DT_S)
         doubted.append(sum(weight for doubts, weight in belief.weights.items() if doubts >> 8 & 1))
     assert 0.2 < doubted[-1] / doubted[9] < 5.0
+
+
+def test_lines_that_the_search_finds_by_turns_are_each_remembered() -> None:
+    """Another thing has three lines; in each frame another one is where its edge is searched.  Each is drawn once."""
+    rng, places, logs = np.random.default_rng(5), (0.0, 25.0, -40.0), []
+    bank, sizes = Bank.empty(1, 8, 1), np.array([0.25, 49.0, 0.05])
+    for t, frame in enumerate(frames_of(rng, 8, 24, 0.5, clean=True)):
+        seen, off = frame.seen, np.array([places[rng.integers(3) if t > 5 else t % 3], 0.0])
+        seen.searched[0, 0] = off
+        seen.lines[0, 0] = seen.image[0, 0] = off + rng.normal((2.0, 0.5), 0.02)
+        logs.append(foreign(bank, 0, seen, 0, t == 0, True, sizes, off, np.zeros(2), True, True))
+    assert min(logs[3:]) > max(logs[:3]) + 1.0
+
+
+def test_a_line_of_its_own_where_nobody_looked_is_not_missed() -> None:
+    """At 3 px from a search that reaches 7 px it is, at 12 px not: what else is there is anything's."""
+    frame = frames_of(np.random.default_rng(3), 4, 1)[0].seen
+    sizes = np.array([0.25, 49.0, 0.05, 0.0, 0.0])
+    anything = stats.norm(0.0, np.sqrt(49.0 + 4e-4)).logpdf(frame.lines[1, 0] - frame.searched[1, 0]).sum()
+    for off_px, missed in ((3.0, 0.05), (12.0, 1.0)):
+        places = frame.searched[1] + np.array([off_px, 0.0])
+        of, log = which(frame, 1, places, np.full((1, 2), 1e-3), sizes)
+        assert of == -1 and log == pytest.approx(np.log(missed) + anything)
+
+
+def test_what_lies_flush_over_the_ends_is_no_slide() -> None:
+    """Both fingers' ends are found 4 mm along, to a hundredth of a pixel; nothing else tells of that direction."""
+    frames = frames_of(np.random.default_rng(9), 8, 6, 0.0, clean=True)
+    rows = frames[0].seen.rows[:, 0]
+    for columns in (slice(0, 3), slice(12, 15)):
+        rows[:, :, columns] -= (rows[:, :, columns] @ ALONG)[..., None] * ALONG
+    rows[:, :, 19:21] = 0.0
+    for finger in range(2):
+        ends, along = slice(2 * finger, 2 * finger + 2), np.array([5000.0, 300.0])
+        rows[ends, :, 19 + finger] = along
+        for columns in (slice(0, 3), slice(12, 15)):
+            rows[ends, :, columns] += along[:, None] * ALONG
+    doubts = [Doubt(np.arange(8) < 4, Rates(1e-1, 0.02, 0.0, 0.2), np.array([True, True]))]
+    belief = Belief(doubts, ALONG, replace(Priors(), missed=0.05))
+    for t, frame in enumerate(frames):
+        seen = frame.seen._replace(rows=frames[0].seen.rows)
+        seen.lines[:] = np.random.default_rng(t).normal(0.0, 0.05, seen.lines.shape)
+        seen.searched[:] = seen.asked[:, None] * 0.0
+        if t == len(frames) - 1:
+            seen.lines[:4, 0] += 4e-3 * np.array([5000.0, 300.0])
+            seen.searched[:4, 0] = seen.lines[:4, 0]
+        seen.image[:] = seen.lines
+        believed = belief.update(seen, DT_S)
+    assert belief.weights[1] > 0.9 and abs(believed.motion[:3] @ ALONG) < believed.bound.position_m
 
 
 @pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.5, 0.0), (0.8, 0.8), (0.95, 0.95), (0.95, 0.3), (1.0, 1.0)])
