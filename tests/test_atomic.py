@@ -16,7 +16,7 @@ OTHERWISE = {
     "model/atomic.py",
     "io/wire/certificates.py",  # keys, which nobody else may read for a moment
     "daemon/estimates.py",  # lines, as they come
-    "client/alert_log.py",
+    "cli/alert_log.py",
     "analyse/dataset.py",
     "daemon/starting.py",  # whether lines can be written there
     "cli/replay.py",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import pytest
 from hypothesis import given
@@ -11,19 +12,10 @@ from support.loopback import frame_record
 from support.timely import clock
 
 from gripmon.client import MonitorName, Policy, Reading, Unusable
-from gripmon.client.inbox import (
-    HELD_BACK_S,
-    NO_LEADS,
-    Entry,
-    Inbox,
-    Leads,
-    Sent,
-    waited_s,
-    with_answer,
-    without_contradicted,
-)
+from gripmon.client.age import NO_LEADS, Leads, Sent, steady_s, waited_s, with_answer, without_contradicted
+from gripmon.client.inbox import HELD_BACK_S, Entry, Inbox
 from gripmon.client.reading import judge
-from gripmon.io.wire import MOST_DRIFT
+from gripmon.io.wire import MOST_DRIFT, steady_ns
 from gripmon.model.records import ClockReading, to_json
 
 WRIST = MonitorName("arm", "wrist")
@@ -123,6 +115,28 @@ def test_the_age_is_what_the_monitor_needed_the_way_and_the_time_since():
     got = reading(heard(sent(98 * S, 100 * S), after(99 * S, 0, 0)))
     assert got.why is Unusable.STALE and got.transform is None
     assert got.reason == "the newest transform is 2.01 s old, at most 0.2 s is allowed"
+
+
+@pytest.mark.parametrize("came", [True, False])
+def test_what_came_before_the_machine_was_suspended_or_waited_meanwhile_is_old(
+    came: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """Of Linux's clocks only ``CLOCK_BOOTTIME`` goes on, and the wall clock."""
+    shown, asleep_ns = time.clock_gettime_ns, [0]
+    monkeypatch.setattr(
+        time, "clock_gettime_ns", lambda clock: shown(clock) + (clock == time.CLOCK_BOOTTIME) * asleep_ns[0]
+    )
+    message, inbox = to_json(frame_record(latency_ns=0)), Inbox()
+    now_ns = steady_ns()
+    inbox.answered(clock(now_ns), now_ns, now_ns)
+    if came:  # otherwise it waits in the socket
+        inbox.take(WRIST, message, steady_s(), Sent(clock(now_ns), steady_ns()))
+        assert reading(inbox, Policy(max_age_s=60.0), steady_s()).usable
+    asleep_ns[0] = 3600 * S
+    if not came:
+        inbox.take(WRIST, message, steady_s(), Sent(clock(now_ns), steady_ns()))
+    got = reading(inbox, Policy(max_age_s=60.0), steady_s())
+    assert got.why is Unusable.STALE and 3600.0 <= got.age_s < 3700.0
 
 
 def test_of_unknown_age_is_not_usable_until_the_monitor_answers():

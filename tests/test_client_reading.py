@@ -233,12 +233,22 @@ def test_a_message_that_is_none_is_counted_said_once_and_changes_nothing(
             inbox.take(WRIST, broken, 100.1)
             assert inbox.unreadable == count
     (said,) = caplog.messages
-    assert said.startswith("arm/wrist: a transform message can't be read: ") and "\n" not in said
+    assert said.startswith("malformed transform on ") and "from arm/wrist, " in said and "\n" not in said
     assert reading(inbox, now_s=100.1).usable
     stale = reading(inbox, now_s=101.0)
     assert stale.why is Unusable.STALE and "; what came since can't be read: " in stale.reason
     inbox.take(WRIST, payload(), 101.0)
     assert reading(inbox, now_s=101.0).usable and inbox.unreadable == 3
+
+
+def test_a_flood_of_broken_messages_each_broken_in_its_own_way_does_not_fill_the_log(caplog: pytest.LogCaptureFixture):
+    inbox, whole = heard(), payload()
+    with caplog.at_level(logging.WARNING):
+        for number in range(2, len(whole)):
+            inbox.take(MonitorName(f"arm{'x' * (number % 7)}", "wrist"), whole[:number], 100.0)
+            inbox.take(WRIST, whole.replace(b'"valid"', b'"v%s"' % whole[number : number + 1].hex().encode()), 100.0)
+    assert inbox.unreadable == 2 * (len(whole) - 2)
+    assert 1 < len(caplog.messages) <= 9  # the first kinds, and "any other"
 
 
 def test_an_older_monitor_has_no_protection_level_and_is_read():

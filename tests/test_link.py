@@ -92,11 +92,10 @@ def test_daemon_and_client_outlive_their_router(router: RouterProcess, endpoint:
     daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         with Client("arm", "wrist", connect=[endpoint]) as client:
-            wait_until(lambda: client.latest() is not None, "the first transform")
+            wait_until(lambda: client.latest().record, "the first transform")
             for _ in range(2):
                 router.kill()
                 before = client.latest()
-                assert before is not None
                 router.start()
                 wait_until(lambda seq=before.seq: client.latest().seq > seq + 10, "transforms after the restart")
             assert client.latest().seq > 20

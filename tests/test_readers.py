@@ -17,7 +17,8 @@ from support import sample_messages
 from support.loopback import WAIT_S, frame_record, free_endpoint, plain_session, wait_until
 from support.published import Published
 
-from gripmon.client.inbox import Inbox, Sent
+from gripmon.client.age import Sent
+from gripmon.client.inbox import Inbox
 from gripmon.client.network import MonitorName, Start
 from gripmon.client.reading import Policy, judge
 from gripmon.io.wire import PublishSettings, steady_ns

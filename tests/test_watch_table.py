@@ -14,8 +14,9 @@ import pytest
 from support.loopback import alert_record, state_record
 
 from gripmon.cli import fleet_table
+from gripmon.cli.alert_log import AlertLog
 from gripmon.cli.watch import _print_alerts
-from gripmon.client import AlertLog, Condition, MonitorName, MonitorStatus, trouble
+from gripmon.client import Condition, MonitorName, MonitorStatus, trouble
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
 RECORDED_NS = GONE_NS = 1_700_000_000_000_000_000
@@ -257,7 +258,7 @@ def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest
 def test_while_nobody_reads_what_is_printed_the_oldest_are_lost(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("gripmon.client.alert_log._WAITING_MOST", 3)
+    monkeypatch.setattr("gripmon.cli.alert_log.WAITING_MOST", 3)
     log = Log(None, as_json=True)
     for i in range(5):
         log.alert(ARM, alert_record(str(i)), to_json(alert_record(str(i))))

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from gripmon.client import Event, MonitorStatus
+    from gripmon.cli.alert_log import Event
+    from gripmon.client import MonitorStatus
     from gripmon.model.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")

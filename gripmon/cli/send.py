@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from typing import TYPE_CHECKING
 
@@ -67,7 +68,7 @@ def send(arguments: Arguments) -> int:
     An impossible command is refused with a reason, and changes nothing.  Every request has an id: if no
     reply came, --request with that id repeats the request, which is not carried out twice.
     """
-    from gripmon.client import snapshots
+    from gripmon.cli import snapshots
 
     if wrong := _misuse(arguments):
         raise InputError(f"send: {wrong}")
@@ -106,14 +107,15 @@ def _misuse(arguments: Arguments) -> str:
 
 def _ask(arguments: Arguments) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
-    from gripmon.client import Ambiguous, Client, NotCarriedOut
+    from gripmon.client import Ambiguous, NotCarriedOut, TransformClient
     from gripmon.model.records import CommandFault, CommandName
 
+    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # the error says what connection is missing
     timeout_s, monitor_id = arguments.timeout, arguments.monitor
     try:
         with input_errors("send"):
             with arguments.network_errors():
-                client = Client(arguments.robot, arguments.camera, **arguments.network())
+                client = TransformClient(arguments.robot, arguments.camera, **arguments.network())
             with client:
                 if arguments.out is not None:
                     return client.snapshot(timeout_s, monitor_id=monitor_id)

@@ -22,7 +22,8 @@ from gripmon.cli.common import (
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
-    from gripmon.client import AlertLog, Fleet, MonitorStatus
+    from gripmon.cli.alert_log import AlertLog
+    from gripmon.client import Fleet, MonitorStatus
 
 _OPTIONS = f"""
 {NETWORK_OPTIONS.format("a monitor's").strip()}
@@ -128,7 +129,7 @@ def _serve(arguments: Arguments, joined: dict[str, Any]) -> None:
 
 
 def _open_log(arguments: Arguments) -> AlertLog:
-    from gripmon.client import AlertLog
+    from gripmon.cli.alert_log import AlertLog
 
     path = arguments.out
     if path is not None:

@@ -9,27 +9,26 @@
         else:
             stop(reading.reason)
 
-:class:`TransformClient` returns the newest transform and whether it may be used.  :class:`Client` reads every message
-unchanged, and sends commands.  :class:`Fleet` shows the state of all monitors on the network.  A client may start
-before the monitor, and reconnects by itself when a monitor or a router restarts.  Neither NumPy nor OpenCV is loaded.
+:class:`TransformClient` returns the newest transform and whether it may be used, each message unchanged
+(``reading.record``), and sends commands; :class:`Client` is its earlier name for those who only do the latter.
+:class:`Fleet` shows the state of all monitors on the network.  A client may start before the monitor, and reconnects by
+itself when a monitor or a router restarts.  Neither NumPy nor OpenCV is loaded.
 """
 
 from __future__ import annotations
 
-from gripmon.client.alert_log import AlertLog, Event
-from gripmon.client.asking import Ambiguous, NotCarriedOut
+from gripmon.client.commands import Ambiguous
 from gripmon.client.fleet import Condition, Fleet, MonitorStatus, trouble
-from gripmon.client.network import MonitorName
-from gripmon.client.reader import Client
+from gripmon.client.network import MonitorName, NotCarriedOut
 from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
 from gripmon.client.transforms import TransformClient
 
+Client = TransformClient
+
 __all__ = [
-    "AlertLog",
     "Ambiguous",
     "Client",
     "Condition",
-    "Event",
     "Fleet",
     "MonitorName",
     "MonitorStatus",

@@ -17,17 +17,11 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from gripmon.client.asking import Asker, NotCarriedOut
-from gripmon.client.network import (
-    Listener,
-    MonitorName,
-    monitor_name,
-    named_as_arguments,
-    reader_settings,
-    start_of,
-    where_of,
-)
-from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, in_zenohs_thread
+from gripmon.client.age import steady_s
+from gripmon.client.commands import ask
+from gripmon.client.network import Joined, MonitorName, monitor_name, start_of
+from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, in_zenohs_thread
+from gripmon.io.wire.link import Malformed
 from gripmon.model.records import (
     AlertRecord,
     CommandName,
@@ -133,13 +127,12 @@ class _Known:
     present: bool = False
     gone_since_ns: int | None = None
     state: StateRecord | None = None
-    unreadable: str = ""
     transforms_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_TRANSFORMS))
     starts: dict[str, tuple[StateRecord | None, float]] = field(default_factory=dict)
     alerts: deque[int] = field(default_factory=lambda: deque(maxlen=_ALERTS_KEPT))
 
 
-class Fleet(Listener):
+class Fleet(Joined):
     """Subscribes to every monitor's state and liveliness token, and optionally to more.  Thread-safe.
 
     State messages come once a second regardless of the cameras' rates, so this works for thousands of robots.  The last
@@ -161,23 +154,21 @@ class Fleet(Listener):
         gets a monitor that has appeared (``gone_since_ns`` is None) or vanished.  Both are called in Zenoh's threads:
         they must return quickly and not raise.  Raises :class:`gripmon.io.wire.PublishError`.
         """
-        super().__init__()
-        self.unreadable = 0
         self._transforms, self._on_alert, self._on_presence = transforms, on_alert, on_presence
+        self._malformed = Malformed("message", "gripmon/*/*")
         self._known: dict[MonitorName, _Known] = {}
-        self._lock = threading.Lock()  # guards the attributes above against Zenoh's threads
-        self._keys = Keys("*", "*")
-        self._declared: list[object] = []  # Zenoh undeclares what is no longer referenced
-        settings = reader_settings(connect, zenoh_config_file)
-        self._where = where_of(settings)
-        self._asker: Asker | None = None  # None before there is a session
-        with named_as_arguments():
-            self._link = Link(settings)
-        self._link.attach(self._declare)
+        self._lock = threading.Lock()  # guards the one above against Zenoh's threads
+        super().__init__(connect, zenoh_config_file)
+        self._join()
+
+    @property
+    def unreadable(self) -> int:
+        """How many messages could not be read; the log says once what was wrong with them."""
+        return self._malformed.count
 
     def monitors(self) -> list[MonitorStatus]:
         """All monitors seen since the start, unordered; each of several present under one name."""
-        now_s = time.monotonic()
+        now_s = steady_s()
         with self._lock:
             return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
 
@@ -193,51 +184,45 @@ class Fleet(Listener):
         """Send one of them a command, as :meth:`gripmon.client.Client.send` does; returns the reply and its attachment,
         a snapshot's image.  Raises as that does.
         """
-        if self._asker is None:
-            raise NotCarriedOut(f"there is no connection to {self._where}")
-        return self._asker.ask(Keys(*monitor), CommandRequest(argument, uuid.uuid4().hex, monitor_id), name, timeout_s)
+        request = CommandRequest(argument, uuid.uuid4().hex, monitor_id)
+        return ask(self, Keys(*monitor), request, name, timeout_s)
 
-    def fault(self) -> str:
-        """Why there is no session, in a few words; empty if there is one."""
-        return self._link.fault()
+    def _after_fork(self) -> None:
+        super()._after_fork()
+        self._lock = threading.Lock()
 
-    def close(self) -> None:
-        """Leave the network."""
-        self._link.close()
-
-    def _declare(self, session: zenoh.Session) -> None:
-        keys, tokens = self._keys, session.liveliness()
-        self._asker = Asker(session, self._where)
-        self._declared = [
+    def _declare(self, session: zenoh.Session) -> Sequence[object]:
+        keys, tokens = Keys("*", "*"), session.liveliness()
+        declared: list[object] = [
             session.declare_subscriber(keys["state"], in_zenohs_thread(self._take_state)),
             tokens.declare_subscriber(keys["alive"], in_zenohs_thread(self._take_token), history=True),
             tokens.declare_subscriber(keys["alive/*"], in_zenohs_thread(self._take_start), history=True),
         ]
         if self._transforms:
-            self._declared.append(session.declare_subscriber(keys["transform"], in_zenohs_thread(self._take_transform)))
+            declared.append(session.declare_subscriber(keys["transform"], in_zenohs_thread(self._take_transform)))
         if self._on_alert is not None:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
             recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
-            self._declared.append(
-                zenoh.ext.declare_advanced_subscriber(
-                    session, keys["alert"], in_zenohs_thread(self._take_alert), history=history, recovery=recovery
-                )
+            take = in_zenohs_thread(self._take_alert)
+            declared.append(
+                zenoh.ext.declare_advanced_subscriber(session, keys["alert"], take, history=history, recovery=recovery)
             )
+        return declared
 
     def _take_state(self, sample: zenoh.Sample) -> None:
         name = monitor_name(sample.key_expr)
-        record = self._read(name, sample, StateRecord)
+        record = self._read(sample, StateRecord)
         if record is None:
             return
         with self._lock:
             known = self._about(name)
             if known is not None:
-                known.state, known.heard_s = record, time.monotonic()
+                known.state, known.heard_s = record, steady_s()
                 if record.monitor_id in known.starts:
                     known.starts[record.monitor_id] = record, known.heard_s
 
     def _take_start(self, token: zenoh.Sample) -> None:
-        start, now_s = start_of(token.key_expr), time.monotonic()
+        start, now_s = start_of(token.key_expr), steady_s()
         with self._lock:
             known = self._about(start.monitor)
             if known is None:
@@ -251,7 +236,7 @@ class Fleet(Listener):
                 known.starts.setdefault(start.monitor_id, (state, now_s))
 
     def _take_token(self, token: zenoh.Sample) -> None:
-        name, now_s = monitor_name(token.key_expr), time.monotonic()
+        name, now_s = monitor_name(token.key_expr), steady_s()
         with self._lock:
             known = self._about(name)
             if known is None or known.present == (token.kind == zenoh.SampleKind.PUT):
@@ -269,11 +254,11 @@ class Fleet(Listener):
         with self._lock:
             known = self._about(monitor_name(sample.key_expr))
             if known is not None:
-                known.transforms_s.append(time.monotonic())
+                known.transforms_s.append(steady_s())
 
     def _take_alert(self, sample: zenoh.Sample) -> None:
         name = monitor_name(sample.key_expr)
-        record = self._read(name, sample, AlertRecord)
+        record = self._read(sample, AlertRecord)
         if record is None or self._on_alert is None:
             return
         payload = sample.payload.to_bytes()
@@ -284,26 +269,21 @@ class Fleet(Listener):
             known.alerts.append(hash(payload))
         self._on_alert(name, record, payload)
 
-    def _read(self, name: MonitorName, sample: zenoh.Sample, kind: type[_T]) -> _T | None:
-        """The message; None if it is invalid, which is counted, and logged once per monitor and reason."""
+    def _read(self, sample: zenoh.Sample, kind: type[_T]) -> _T | None:
+        """The message; None if it is invalid, which is counted, and logged once."""
         try:
-            return from_json(sample.payload.to_bytes(), kind)
+            record = from_json(sample.payload.to_bytes(), kind)
         except MessageRefused as error:
-            text = str(error)
-        with self._lock:
-            self.unreadable += 1
-            known = self._about(name)
-            if known is None or known.unreadable == text:
-                return None
-            known.unreadable = text
-        _log.warning("%s: a message can't be read: %s", name, text)
-        return None
+            self._malformed.add(f"from {monitor_name(sample.key_expr)}, {error}")
+            return None
+        self._malformed.good()
+        return record
 
     def _about(self, name: MonitorName) -> _Known | None:
         """The entry of a monitor, new if needed; None if there are too many.  The lock must be held."""
         known = self._known.get(name)
         if known is None and len(self._known) < MONITORS_KEPT:
-            known = self._known[name] = _Known(time.monotonic())
+            known = self._known[name] = _Known(steady_s())
             if len(self._known) == MONITORS_KEPT:
                 _log.error("%d monitors; any more are not listened to", MONITORS_KEPT)
         return known

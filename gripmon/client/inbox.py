@@ -1,12 +1,4 @@
-"""Messages received from the network: Zenoh's threads write, any number of other threads read without waiting.
-
-The delay of a transform is bounded without synchronised clocks.  A message contains the reading of the monitor's
-steady clock when it was sent.  This alone is not enough: a message delayed by ten seconds looks like one from a clock
-that is ten seconds behind, and even the fastest message so far may have been delayed.  A query and its reply give a
-bound: the clock in the reply was read after the query was sent, so the monitor's clock is ahead of ours by at most the
-difference of the two readings, however long either was on its way.  From then on the bound grows with the drift of the
-two clocks, and every further reply can only lower it.
-"""
+"""Messages received from the network: Zenoh's threads write, any number of other threads read without waiting."""
 
 from __future__ import annotations
 
@@ -14,24 +6,16 @@ import logging
 import math
 import threading
 import weakref
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+from gripmon.client.age import NO_LEADS, Leads, Sent, steady_s, waited_s, with_answer, without_contradicted
 from gripmon.client.network import MonitorName, Start
-from gripmon.io.wire import MOST_DRIFT
-from gripmon.model.records import (
-    ClockReading,
-    FrameRecord,
-    MessageRefused,
-    Verdict,
-    from_json,
-)
+from gripmon.io.wire.link import REMEMBERED_S, Malformed
+from gripmon.model.records import ClockReading, FrameRecord, MessageRefused, Verdict, from_json
 
 _log = logging.getLogger(__name__)
 
-_CLOCKS_KEPT = 16
-"""Each start of a monitor has one clock, and a malicious sender may invent any number."""
 PRESENT_KEPT = 16
 """Monitors whose names are kept: two are too many already, and a malicious sender may invent any number."""
 HELD_BACK_S = 1.0
@@ -40,60 +24,7 @@ reply takes milliseconds."""
 SENDS_S = 1.0
 """A monitor that sent a transform within this time is present, even if a router's rules block its liveliness token."""
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length
-
-
-class Sent(NamedTuple):
-    """The monitor's clock when a message was sent, and our steady clock (ns) when it arrived."""
-
-    reading: ClockReading
-    arrived_ns: int
-
-
-class Lead(NamedTuple):
-    """At ``at_ns`` of our steady clock, a monitor's clock led it by at most ``most_ns``; both may be negative."""
-
-    most_ns: int
-    at_ns: int
-
-    def most_at_ns(self, when_ns: int) -> int:
-        """The bound at another time, ns, with the clocks' drift since."""
-        return self.most_ns + math.ceil(MOST_DRIFT * abs(when_ns - self.at_ns))
-
-
-Leads = Mapping[str, Lead]
-"""Leads by the clock's name."""
-
-NO_LEADS: Leads = MappingProxyType({})
-
-
-def with_answer(leads: Leads, answer: ClockReading, asked_ns: int, answered_ns: int) -> Leads:
-    """The leads after a reply; a bound that contradicts it is from before a clock jumped, and is dropped."""
-    round_trip_ns = answered_ns - asked_ns
-    lead = Lead(answer.now_ns - asked_ns + math.ceil(MOST_DRIFT * round_trip_ns), asked_ns)
-    before = leads.get(answer.clock)
-    if before is not None and before.most_at_ns(answered_ns) >= answer.now_ns - answered_ns:
-        lead = min(lead, before, key=lambda each: each.most_at_ns(answered_ns))
-    kept = {clock: known for clock, known in leads.items() if clock != answer.clock}
-    return dict(list(kept.items())[1 - _CLOCKS_KEPT :]) | {answer.clock: lead}
-
-
-def without_contradicted(leads: Leads, sent: Sent) -> Leads:
-    """The leads after a message; its clock is dropped if the message would have arrived before it was sent."""
-    waited_ns = _waited_ns(leads, sent)
-    if waited_ns is None or waited_ns >= 0:
-        return leads
-    return {clock: lead for clock, lead in leads.items() if clock != sent.reading.clock}
-
-
-def waited_s(leads: Leads, sent: Sent | None) -> float | None:
-    """Upper bound of the message's delay, s; None if unknown."""
-    waited_ns = None if sent is None else _waited_ns(leads, sent)
-    return None if waited_ns is None else 1e-9 * waited_ns
-
-
-def _waited_ns(leads: Leads, sent: Sent) -> int | None:
-    lead = leads.get(sent.reading.clock)
-    return None if lead is None else sent.arrived_ns + lead.most_at_ns(sent.arrived_ns) - sent.reading.now_ns
+CLOSED = "the client is closed"
 
 
 def transform_message(payload: bytes) -> FrameRecord:
@@ -123,7 +54,7 @@ def transform_message(payload: bytes) -> FrameRecord:
 
 
 class Entry(NamedTuple):
-    """A record, its sender, and its arrival by the monotonic clock; ``sent`` None: the monitor sends no clock."""
+    """A record, its sender, and its arrival by our steady clock; ``sent`` None: the monitor sends no clock."""
 
     record: FrameRecord
     monitor: MonitorName
@@ -139,16 +70,16 @@ class Heard(NamedTuple):
     """The state from which readings are made; replaced as a whole, so that reading it needs no lock.
 
     ``present``: monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry`` has
-    vanished since; ``unreadable``: what was wrong with the last message, if it was unreadable; ``leads``: bounds of the
-    monitors' clocks.  ``starts``: the processes of these monitors, by their tokens; ``senders``: when each was last
-    heard; ``elsewhere``: other monitors found on the network.
+    vanished since; ``unreadable``: what was wrong with the last message, if it was unreadable; ``closed``: why no more
+    messages come, empty while they may; ``leads``: bounds of the monitors' clocks.  ``starts``: the processes of these
+    monitors, by their tokens; ``senders``: when each was last heard; ``elsewhere``: other monitors on the network.
     """
 
     entry: Entry | None = None
     present: frozenset[MonitorName] = frozenset()
     cut: bool = False
     unreadable: str = ""
-    closed: bool = False
+    closed: str = ""
     leads: Leads = NO_LEADS
     starts: frozenset[Start] = frozenset()
     senders: tuple[tuple[Start, float], ...] = ()
@@ -165,25 +96,36 @@ class Waiter(Protocol):
 class Inbox:
     """The newest message, the monitors present, and the iterators that wait for the next message."""
 
-    def __init__(self) -> None:
+    def __init__(self, key: str = "") -> None:
+        """``key`` of the messages, for the log."""
         self.heard = Heard()
-        self.unreadable = 0
+        self._malformed = Malformed("transform", key)
         self._lock = threading.Lock()  # for writers
         self._held: Entry | None = None
         self._held_since_s: float | None = None
+        self._several_said_s = -math.inf
         self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # a released iterator gets no more messages
+
+    @property
+    def unreadable(self) -> int:
+        """How many messages could not be read."""
+        return self._malformed.count
 
     def take(self, monitor: MonitorName, payload: bytes, arrival_s: float, sent: Sent | None = None) -> None:
         """A message arrived."""
         try:
             entry = Entry(transform_message(payload), monitor, arrival_s, sent)
         except MessageRefused as error:
-            self._refuse(monitor, str(error))
+            self._malformed.add(f"from {monitor}, {error}")
+            with self._lock:
+                self._set(unreadable=str(error))
             return
+        self._malformed.good()
         with self._lock:
             leads = self.heard.leads if sent is None else without_contradicted(self.heard.leads, sent)
             present, senders = self._present_with(monitor), _with_sender(self.heard.senders, entry)
             self._set(entry=entry, present=present, cut=False, unreadable="", leads=leads, senders=senders)
+            self._say_if_several()
             self._hand_over(entry)
 
     def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
@@ -204,6 +146,7 @@ class Inbox:
         """Its liveliness token is there."""
         with self._lock:
             self._set(present=self._present_with(monitor))
+            self._say_if_several()
             self._wake()
 
     def vanished(self, monitor: MonitorName) -> None:
@@ -216,6 +159,7 @@ class Inbox:
         with self._lock:
             if len(self.heard.starts) < PRESENT_KEPT:
                 self._set(starts=self.heard.starts | {start})
+            self._say_if_several()
             self._wake()
 
     def ended(self, start: Start) -> None:
@@ -229,11 +173,17 @@ class Inbox:
             if len(self.heard.elsewhere) < PRESENT_KEPT:
                 self._set(elsewhere=self.heard.elsewhere | {monitor})
 
-    def close(self) -> None:
+    def close(self, why: str = CLOSED) -> None:
         """Stop: no more messages will come."""
         with self._lock:
-            self._set(closed=True)
+            self._set(closed=self.heard.closed or why)
             self._wake()
+
+    def after_fork(self, why: str) -> None:
+        """In the child: the lock may be held by a thread that isn't there, and nobody waits."""
+        self._lock = threading.Lock()
+        self._waiters = weakref.WeakSet()
+        self.close(why)
 
     def join(self, waiter: Waiter) -> None:
         """Pass every message from now on to ``waiter``, as long as it is referenced elsewhere."""
@@ -242,34 +192,24 @@ class Inbox:
 
     def _hand_over(self, entry: Entry) -> None:
         """Pass a message to the waiters; one of unknown age is held back for :data:`HELD_BACK_S` at most."""
-        if entry.sent is not None and waited_s(self.heard.leads, entry.sent) is None:
+        self._held = None
+        if entry.sent is None or waited_s(self.heard.leads, entry.sent) is not None:
+            self._held_since_s = None
+        else:
             if self._held_since_s is None:
                 self._held_since_s = entry.arrival_s
             if entry.arrival_s - self._held_since_s < HELD_BACK_S:
                 self._held = entry
                 return
-        else:
-            self._held_since_s = None
-        self._held = None
         for waiter in self._waiters:
             waiter.put(entry)
-
-    def _refuse(self, monitor: MonitorName, text: str) -> None:
-        with self._lock:
-            self.unreadable += 1
-            if self.heard.unreadable != text:  # logged once, and again when the fault changes or recurs
-                _log.warning("%s: a transform message can't be read: %s", monitor, text)
-                self._set(unreadable=text)
 
     def _present_with(self, monitor: MonitorName) -> frozenset[MonitorName]:
         present = self.heard.present
         return present if len(present) >= PRESENT_KEPT else present | {monitor}
 
     def _set(self, **changes: object) -> None:
-        before = self.heard
-        self.heard = before._replace(**changes)  # type: ignore[arg-type]
-        if len(self.heard.present) > 1 >= len(before.present) or len(self.heard.starts) > 1 >= len(before.starts):
-            _log.error("%s", several(self.heard, 0.0))
+        self.heard = self.heard._replace(**changes)  # type: ignore[arg-type]
 
     def _cut_off(self, gone: Callable[[Start], bool], **changes: object) -> None:
         """Remove the starts for which ``gone`` is true, and apply ``changes``."""
@@ -279,17 +219,23 @@ class Inbox:
         self._set(cut=cut, senders=senders, **changes)
         self._wake()
 
+    def _say_if_several(self) -> None:
+        """Log it if tokens or names show it, but not again and again: any sender on the network may cause it."""
+        if steady_s() - self._several_said_s > REMEMBERED_S and (text := several(self.heard, math.inf)):
+            self._several_said_s = steady_s()
+            _log.error("%s", text)
+
     def _wake(self) -> None:
         for waiter in self._waiters:
             waiter.wake()
 
 
-def several(heard: Heard, now_s: float) -> str:
-    """A message if more than one monitor is present at ``now_s``; empty otherwise."""
+def several(heard: Heard, at_s: float) -> str:
+    """A message if more than one monitor is present at ``at_s`` of our steady clock; empty otherwise."""
     if len(heard.present) > 1:  # the camera was not named
         names = ", ".join(map(str, sorted(heard.present)))
         return f"more than one monitor is there: {names}; name the camera"
-    starts = heard.starts.union(start for start, sent_s in heard.senders if now_s - sent_s < SENDS_S)
+    starts = heard.starts.union(start for start, sent_s in heard.senders if at_s - sent_s < SENDS_S)
     if len(starts) < 2:
         return ""
     return f"more than one monitor has the same name: {', '.join(map(str, sorted(starts)))}; stop all but one"
@@ -297,6 +243,6 @@ def several(heard: Heard, now_s: float) -> str:
 
 def _with_sender(senders: tuple[tuple[Start, float], ...], entry: Entry) -> tuple[tuple[Start, float], ...]:
     """With the sender of ``entry``, and without silent ones."""
-    start, now_s = entry.start, entry.arrival_s
-    others = tuple(sender for sender in senders if sender[0] != start and now_s - sender[1] < SENDS_S)
-    return (*others[1 - PRESENT_KEPT :], (start, now_s))
+    start, at_s = entry.start, entry.arrival_s
+    others = tuple(sender for sender in senders if sender[0] != start and at_s - sender[1] < SENDS_S)
+    return (*others[1 - PRESENT_KEPT :], (start, at_s))

@@ -17,7 +17,6 @@ import numpy as np
 import zenoh
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 
-from gripmon.client.network import reader_settings
 from gripmon.client.reading import Reading
 from gripmon.client.trained import (
     CameraMoved,
@@ -29,7 +28,7 @@ from gripmon.client.trained import (
     usable_poses,
 )
 from gripmon.client.transforms import TransformClient
-from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
+from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, PublishSettings
 from gripmon.model.lerobot_columns import extrinsics_features
 from gripmon.model.records import FrameNote, to_json
 
@@ -76,7 +75,7 @@ class ExtrinsicsStep(ObservationProcessorStep):  # type: ignore[misc]
         self._link: Link | None = None
         self._publisher: zenoh.Publisher | None = None
         if self.feed:
-            self._link = Link(reader_settings(self.connect, None))
+            self._link = Link(PublishSettings(listen=(), connect=tuple(self.connect)))
             self._link.attach(self._declare)
 
     @property

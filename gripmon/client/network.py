@@ -1,16 +1,20 @@
-"""How clients join the network, and the names in keys."""
+"""How clients join the network and leave it, and the names in keys."""
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Self, TypeVar
 
-from gripmon.io.wire import PublishError, PublishSettings
+import zenoh
 
-_ARGUMENTS = {"zenoh_config": "zenoh_config_file"}
+from gripmon.io.wire import Link, PublishError, PublishSettings
+from gripmon.model.records import CommandFault
+
 _T = TypeVar("_T")
+FORKED = "this process was forked from the one that opened the client; open another one here"
 
 
 class MonitorName(NamedTuple):
@@ -44,33 +48,45 @@ def monitor_name(key: object) -> MonitorName:
     return MonitorName(robot, camera)
 
 
-def reader_settings(connect: str | Sequence[str], zenoh_config_file: str | None) -> PublishSettings:
-    """Connect to these endpoints (a text is a single one) without listening; or as a Zenoh file says."""
-    if zenoh_config_file is not None:
-        return PublishSettings(zenoh_config=zenoh_config_file)
-    return PublishSettings(listen=(), connect=(connect,) if isinstance(connect, str) else tuple(connect))
+class NotCarriedOut(Exception):
+    """A command got no reply from the monitor: it isn't there, or it had no time; ``fault`` says which.
+
+    A refusal is not an exception but a reply with ``CommandReply.done`` false.  A command that is sent again with the
+    same ``request_id`` is not carried out twice.
+    """
+
+    def __init__(self, text: str, fault: CommandFault | None = None, request_id: str = "") -> None:
+        super().__init__(text)
+        self.fault, self.request_id = fault, request_id
 
 
-def where_of(settings: PublishSettings) -> str:
-    """The endpoints that a reader connects to, for messages."""
-    file = settings.zenoh_config
-    return " or ".join(settings.connect) if file is None else f"what {file} names"
+class Joined:
+    """Base of all clients: a context manager that joins the network when there is somebody to talk to, closes itself,
+    and calls back in separate threads.
 
+    Zenoh's threads don't survive a fork: in the child everything of a client says so, and nothing waits.
+    """
 
-@contextmanager
-def named_as_arguments() -> Iterator[None]:
-    """Make a :class:`PublishError` name a client's argument instead of the daemon's configuration key."""
-    try:
-        yield
-    except PublishError as error:
-        raise PublishError(error.key, error.text, _ARGUMENTS.get(error.key, error.key)) from error
+    def __init__(self, connect: str | Sequence[str], zenoh_config_file: str | None) -> None:
+        """``connect``: endpoints of a monitor or a router; a text is a single one; we don't listen.
 
-
-class Listener:
-    """Base of all clients: a context manager that closes itself, with callbacks in separate threads."""
-
-    def __init__(self) -> None:
+        ``zenoh_config_file``: a Zenoh configuration file instead.  Raises :class:`gripmon.io.wire.PublishError`.
+        """
+        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+        settings = PublishSettings(listen=(), connect=endpoints)
+        if zenoh_config_file is not None:
+            settings = PublishSettings(zenoh_config=zenoh_config_file)
+        self.where = " or ".join(endpoints) if zenoh_config_file is None else f"what {zenoh_config_file} names"
+        self.forked = False
         self._threads: list[threading.Thread] = []
+        self._session: zenoh.Session | None = None
+        self._opened = threading.Event()
+        try:
+            self._link = Link(settings)
+        except PublishError as error:  # name the argument instead of the daemon's configuration key
+            argument = {"zenoh_config": "zenoh_config_file"}.get(error.key, error.key)
+            raise PublishError(error.key, error.text, argument) from error
+        _OPEN.add(self)
 
     def __enter__(self) -> Self:
         return self
@@ -79,10 +95,49 @@ class Listener:
         self.close()
 
     def close(self) -> None:
-        """Wait for running callbacks, unless this is called from one."""
+        """Leave the network, and wait for running callbacks unless this is called from one."""
+        if self.forked:
+            return
+        self._link.close()
         if threading.current_thread() not in self._threads:  # two callbacks that both close would wait for each other
             for thread in self._threads:
                 thread.join()
+
+    def fault(self) -> str:
+        """Why there is no connection, in a few words; empty if there is one.  At any rate: it looks once a second."""
+        if self.forked:
+            return FORKED
+        try:
+            return self._link.fault()
+        except zenoh.ZError:  # another thread is closing the session
+            return "the client is being closed"
+
+    def session(self, timeout_s: float = 0.0) -> zenoh.Session:
+        """The session, once there is one.  Raises :class:`NotCarriedOut`."""
+        if self.forked:
+            raise NotCarriedOut(FORKED)
+        self._opened.wait(timeout_s)
+        if self._session is None:
+            raise NotCarriedOut(f"there is no connection to {self.where}: {self._link.fault()}")
+        return self._session
+
+    def _join(self) -> None:
+        """Join now, or in another thread when a router answers; a subclass calls it when it is complete."""
+
+        def declare(session: zenoh.Session) -> None:
+            self._session = session
+            self._declared = self._declare(session)  # Zenoh undeclares what is no longer referenced
+            self._opened.set()
+
+        self._link.attach(declare)
+
+    def _declare(self, session: zenoh.Session) -> Sequence[object]:
+        """Subscribe; returns what has to be kept."""
+        raise NotImplementedError
+
+    def _after_fork(self) -> None:
+        """In the child, which has only the thread that forked: locks may be held by threads that aren't there."""
+        self.forked, self._threads = True, []
 
     def _call_back(self, callback: Callable[[_T], None], values: Iterable[_T]) -> None:
         def pump() -> None:
@@ -91,3 +146,14 @@ class Listener:
 
         self._threads.append(threading.Thread(target=pump, name="gripmon-client", daemon=True))
         self._threads[-1].start()
+
+
+_OPEN: weakref.WeakSet[Joined] = weakref.WeakSet()
+
+
+def _leave_all() -> None:
+    for client in list(_OPEN):
+        client._after_fork()
+
+
+os.register_at_fork(after_in_child=_leave_all)

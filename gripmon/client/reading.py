@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from gripmon.client.inbox import Entry, Heard, several, waited_s
+from gripmon.client.age import waited_s
+from gripmon.client.inbox import Entry, Heard, several
 from gripmon.client.network import MonitorName
 from gripmon.model.records import (
     Absolute,
@@ -122,6 +123,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     valid_by: ValidBy = ValidBy.ABSOLUTE
     since_reference: SinceReference | None = None
     absolute: Absolute | None = None
+    record: FrameRecord | None = None
 
     def same_revision_as(self, other: Reading) -> bool:
         """Whether both refer to the same reference of the same start of the monitor; only then may they be subtracted.
@@ -153,12 +155,14 @@ def _largest_sigma_m(covariance: tuple[float, ...] | None) -> float:
 
 
 _Refusal = tuple[Unusable, str]
+_FACTS = ("state", "source", "stamp_ns", "seq", "reference_id", "revision", "monitor_id", "valid_by")
+_TO_MOVE_BY = ("covariance", "smoothed", "protection", "since_reference", "absolute")
 
 
 def judge(
     heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_ns: int, fault: Callable[[], str]
 ) -> Reading:
-    """The reading of ``entry`` at ``now_s`` by the monotonic clock, ``wall_ns`` by the wall clock.
+    """The reading of ``entry`` at ``now_s`` by our steady clock, ``wall_ns`` by the wall clock.
 
     ``heard`` says which monitors are present; ``fault``, called only if there is no entry, names a missing connection.
     """
@@ -177,19 +181,9 @@ def judge(
         reason=refusal[1] if refusal else "",
         age_s=age_s,
         transform=None if lost else record.cam_T_grip,
-        covariance=None if lost else record.covariance,
-        smoothed=None if lost else record.smoothed,
-        protection=None if lost else record.protection,
-        state=record.state,
-        source=record.source,
-        stamp_ns=record.stamp_ns,
-        seq=record.seq,
-        reference_id=record.reference_id,
-        revision=record.revision,
-        monitor_id=record.monitor_id,
-        valid_by=record.valid_by,
-        since_reference=None if lost else record.since_reference,
-        absolute=None if lost else record.absolute,
+        record=record,
+        **{name: getattr(record, name) for name in _FACTS},
+        **{name: None if lost else getattr(record, name) for name in _TO_MOVE_BY},  # type: ignore[arg-type]
     )
 
 
@@ -205,7 +199,7 @@ def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: in
 def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None:
     """Refuses if the client is closed, the monitor is gone, or several monitors have the name."""
     if heard.closed:
-        return Unusable.CLOSED, "the client is closed"
+        return Unusable.CLOSED, heard.closed
     if text := several(heard, now_s):
         return Unusable.SEVERAL, text
     if entry is None or not heard.cut:

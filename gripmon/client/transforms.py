@@ -1,4 +1,4 @@
-"""The transforms of one monitor for programs that move by them: the newest at once, or each as it comes."""
+"""One monitor for programs: its newest transform at once, or each as it comes, and commands to it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,33 @@ import asyncio
 import contextlib
 import threading
 import time
+import uuid
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Self
+from collections.abc import Callable, Iterator, Sequence
+from typing import Self, TypeVar
 
+import msgspec
 import zenoh
 
-from gripmon.client.inbox import Entry, Inbox, Sent
-from gripmon.client.network import Listener, monitor_name, named_as_arguments, reader_settings, start_of
+from gripmon.client.age import Sent, steady_s
+from gripmon.client.commands import alive, ask
+from gripmon.client.inbox import Entry, Inbox
+from gripmon.client.network import FORKED, Joined, MonitorName, monitor_name, start_of
 from gripmon.client.reading import NotUsable, Policy, Reading, judge
-from gripmon.io.wire import CLOCK_PARAMETER, DEFAULT_ENDPOINT, Keys, Link, in_zenohs_thread, steady_ns
-from gripmon.model.records import ClockReading, MessageRefused, Verdict, from_json
+from gripmon.io.wire import CLOCK_PARAMETER, DEFAULT_ENDPOINT, Keys, in_zenohs_thread, steady_ns
+from gripmon.model.records import (
+    ClockReading,
+    CommandName,
+    CommandReply,
+    CommandRequest,
+    MessageRefused,
+    ReferenceRecord,
+    StateRecord,
+    Verdict,
+    from_json,
+)
+
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 ASK_EVERY_S = 1.0
 """The bound on a message's age grows by 1 ms meanwhile (:data:`gripmon.io.wire.MOST_DRIFT`); 200 bytes each way."""
@@ -30,11 +46,11 @@ _LOOK_WITHIN_S = 1.0  # running monitors answer in milliseconds
 _LATE_S = 1e-3  # to wake just after a deadline and not just before it
 
 
-class TransformClient(Listener):
-    """Receives the transforms of one monitor.  Thread-safe.
+class TransformClient(Joined):
+    """Receives the transforms of one monitor, and sends it commands.  Thread-safe.
 
     It may start before the monitor and the router, and reconnects by itself when they restart.  It leaves the network
-    at the end of a ``with`` statement or by :meth:`close`.
+    at the end of a ``with`` statement or by :meth:`close`.  A slow reader never delays the monitor.
     """
 
     def __init__(
@@ -57,26 +73,22 @@ class TransformClient(Listener):
         """
         if depth < 1:
             raise ValueError(f"depth is {depth}; give 1 or more")
-        super().__init__()
         self.policy = policy if policy is not None else Policy()
         self.keys = Keys(robot, camera if camera is not None else "*")
         self._depth = depth
-        self._inbox = Inbox()
-        self._session: zenoh.Session | None = None
+        self._inbox = Inbox(self.keys["transform"])
         self._next_question_s = 0.0
-        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what is no longer referenced
-        with named_as_arguments():
-            self._link = Link(reader_settings(connect, zenoh_config_file))
-        self._link.attach(self._declare)
+        super().__init__(connect, zenoh_config_file)
+        self._join()
 
     def latest(self, policy: Policy | None = None) -> Reading:
         """The newest transform and whether it may be used now, by the client's policy or the given one.
 
-        Returns immediately: it takes no lock, makes no system call and raises nothing.  (Before the first transform it
+        Returns immediately: it takes no lock, waits for nothing and raises nothing.  (Before the first transform it
         also looks at the session, to name the endpoint to which there is no connection.)
         """
         heard = self._inbox.heard
-        return judge(heard, heard.entry, policy or self.policy, time.monotonic(), time.time_ns(), self._fault)
+        return judge(heard, heard.entry, policy or self.policy, steady_s(), time.time_ns(), self.fault)
 
     def require(self, policy: Policy | None = None) -> Reading:
         """As :meth:`latest`, but raises :class:`NotUsable` unless the policy allows the transform."""
@@ -95,11 +107,9 @@ class TransformClient(Listener):
         self._inbox.join(readings)
         return readings
 
-    def __aiter__(self) -> AsyncReadings:
+    def __aiter__(self) -> Readings:
         """The same for asyncio; to be called while its event loop runs."""
-        readings = AsyncReadings(self, self._depth)
-        self._inbox.join(readings)
-        return readings
+        return iter(self)
 
     def on_transform(self, callback: Callable[[Reading], None]) -> None:
         """Call back with every reading that an iterator would return, in a separate thread, until the client is closed.
@@ -108,6 +118,46 @@ class TransformClient(Listener):
         """
         self._call_back(callback, iter(self))
 
+    def state(self, timeout_s: float = 1.0) -> StateRecord | None:
+        """The monitor's last state message; None if no monitor answers in time.  LookupError if several do."""
+        return self._get("state", StateRecord, timeout_s)
+
+    def reference(self, timeout_s: float = 1.0) -> ReferenceRecord | None:
+        """The reference from which drift is measured now; None if no monitor answers in time.  LookupError if several
+        do.
+        """
+        return self._get("reference", ReferenceRecord, timeout_s)
+
+    def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
+        """The running monitors of this name, sorted; all on the network for ``TransformClient("*")``."""
+        return alive(self.session(timeout_s), self.keys, timeout_s)
+
+    def send(
+        self,
+        name: CommandName,
+        argument: str = "",
+        timeout_s: float = 5.0,
+        *,
+        request_id: str | None = None,
+        monitor_id: str = "",
+    ) -> CommandReply:
+        """Send the monitor a command (:class:`gripmon.model.records.Command`) and wait for its reply.
+
+        A refused command changes nothing.  ``request_id`` (at most 64 characters; by default a new one): that of an
+        earlier attempt; if that was carried out, its reply is returned again.  ``monitor_id`` names one start of the
+        monitor; without it only one may be running.  Raises :class:`gripmon.client.NotCarriedOut`;
+        :class:`gripmon.client.Ambiguous` if several monitors have the name; ValueError for an invalid request.
+        """
+        new_id = uuid.uuid4().hex if request_id is None else request_id
+        return ask(self, self.keys, CommandRequest(argument, new_id, monitor_id), name, timeout_s)[0]
+
+    def snapshot(self, timeout_s: float = 5.0, *, monitor_id: str = "") -> tuple[CommandReply, bytes | None]:
+        """The monitor's state and newest frame, and its image as a file of the type ``reply.snapshot.image`` (None if
+        there is none).  Raises as :meth:`send`.
+        """
+        request = CommandRequest("", uuid.uuid4().hex, monitor_id)
+        return ask(self, self.keys, request, CommandName.SNAPSHOT, timeout_s)
+
     @property
     def unreadable(self) -> int:
         """How many messages could not be read; the log says once what was wrong with them."""
@@ -115,7 +165,7 @@ class TransformClient(Listener):
 
     @property
     def closed(self) -> bool:
-        return self._inbox.heard.closed
+        return bool(self._inbox.heard.closed)
 
     def close(self) -> None:
         """Leave the network: iterators and callbacks end, nothing is usable any more.  May be called twice.
@@ -123,12 +173,11 @@ class TransformClient(Listener):
         It waits for a running callback, unless it is called from one.
         """
         self._inbox.close()
-        self._link.close()
         super().close()
 
     def judge(self, entry: Entry) -> Reading:
         """The reading of a message, as of now."""
-        return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
+        return judge(self._inbox.heard, entry, self.policy, steady_s(), time.time_ns(), self.fault)
 
     def look_around(self) -> None:
         """Query, without waiting, which monitors are on the network; ``reason`` then names them."""
@@ -142,16 +191,13 @@ class TransformClient(Listener):
                 everyone, found = Keys("*", "*")["alive"], in_zenohs_thread(find)
                 self._session.liveliness().get(everyone, found, timeout=_LOOK_WITHIN_S)
 
-    def _fault(self) -> str:
-        try:
-            return self._link.fault()
-        except zenoh.ZError:  # another thread is closing the session
-            return "the client is being closed"
+    def _after_fork(self) -> None:
+        super()._after_fork()
+        self._inbox.after_fork(FORKED)
 
-    def _declare(self, session: zenoh.Session) -> None:
-        self._session = session
+    def _declare(self, session: zenoh.Session) -> Sequence[object]:
         keys, tokens = self.keys, session.liveliness()
-        self._declared = (
+        return (
             session.declare_subscriber(keys["transform"], in_zenohs_thread(self._receive)),
             tokens.declare_subscriber(keys["alive"], in_zenohs_thread(self._see), history=True),
             tokens.declare_subscriber(keys["alive/*"], in_zenohs_thread(self._see_start), history=True),
@@ -159,10 +205,10 @@ class TransformClient(Listener):
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            arrival_s, arrived_ns = time.monotonic(), steady_ns()
+            arrived_ns = steady_ns()
             reading = None if sample.attachment is None else _clock_reading(sample.attachment)
             sent = None if reading is None else Sent(reading, arrived_ns)
-            self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s, sent)
+            self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), 1e-9 * arrived_ns, sent)
             if sent is not None:
                 self._ask_for_clock(known=self._inbox.age_known)
 
@@ -178,11 +224,10 @@ class TransformClient(Listener):
 
     def _ask_for_clock(self, *, known: bool) -> None:
         """Query the monitor's clock if due, sooner if nothing is ``known`` yet.  Called in Zenoh's threads."""
-        session, now_s = self._session, time.monotonic()
-        if session is None or now_s < self._next_question_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
+        session, asked_ns = self._session, steady_ns()
+        if session is None or 1e-9 * asked_ns < self._next_question_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
             return
-        self._next_question_s = now_s + ASK_EVERY_S
-        asked_ns = steady_ns()
+        self._next_question_s = 1e-9 * asked_ns + ASK_EVERY_S
 
         def take(reply: zenoh.Reply) -> None:
             answered_ns = steady_ns()
@@ -202,6 +247,16 @@ class TransformClient(Listener):
                 express=True,
             )
 
+    def _get(self, leaf: str, record_type: type[_T], timeout_s: float) -> _T | None:
+        answers: dict[MonitorName, _T] = {}
+        for reply in self.session(timeout_s).get(self.keys[leaf], timeout=timeout_s):
+            if reply.ok is not None:
+                answers[monitor_name(reply.ok.key_expr)] = from_json(reply.ok.payload.to_bytes(), record_type)
+        if len(answers) > 1:
+            names = ", ".join(map(str, sorted(answers)))
+            raise LookupError(f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {names}; name the one")
+        return next(iter(answers.values()), None)
+
 
 def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
     try:
@@ -210,20 +265,23 @@ def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
         return None
 
 
-class _Queue:
-    """The queue of one reader: the newest ``depth`` messages; older ones are dropped.
+class Readings(Iterator[Reading]):
+    """The queue of one reader, a thread or a task of asyncio: the newest ``depth`` messages; older ones are dropped.
 
     In addition it returns, once, a reading of verdict ``unknown`` when the last one expires, because the monitor
     vanished or nothing newer came in time; and, once, one that says why if no first message comes.  So a loop that only
-    waits for the next reading also stops in time.
+    waits for the next reading also stops in time.  It ends when the client is closed.  A cancelled wait of asyncio
+    loses nothing: the next ``anext`` continues.
     """
 
     def __init__(self, client: TransformClient, depth: int) -> None:
         self._client = client
         self._entries: deque[Entry] = deque(maxlen=depth)
+        self._news = threading.Event()
+        self._waiting: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
         self._given = client.latest()
         waits = self._given.verdict is Verdict.UNKNOWN
-        self._look_s = time.monotonic() + FIRST_WITHIN_S - _LOOK_AROUND_S if waits else None
+        self._look_s = steady_s() + FIRST_WITHIN_S - _LOOK_AROUND_S if waits else None
         self._say_s: float | None = None
 
     def put(self, entry: Entry) -> None:
@@ -231,52 +289,11 @@ class _Queue:
         self.wake()
 
     def wake(self) -> None:
-        raise NotImplementedError
-
-    def _take(self) -> Reading | None:
-        """The next reading if there is one."""
-        if self._entries:
-            self._look_s = self._say_s = None
-            self._given = self._client.judge(self._entries.popleft())
-            return self._given
-        if self._given.verdict is not Verdict.UNKNOWN and (now := self._client.latest()).verdict is Verdict.UNKNOWN:
-            self._given = now
-            return now
-        return self._silence(time.monotonic())
-
-    def _silence(self, now_s: float) -> Reading | None:
-        """A reading that says why there is no first message, when it is due."""
-        if self._look_s is not None and now_s >= self._look_s:
-            self._look_s, self._say_s = None, now_s + _LOOK_AROUND_S
-            self._client.look_around()
-        elif self._say_s is not None and now_s >= self._say_s:
-            self._say_s = None
-            self._given = self._client.latest()
-            return self._given
-        return None
-
-    def _patience_s(self) -> float | None:
-        """Time until the next check if nothing arrives, s; None: no check."""
-        next_s = self._look_s if self._look_s is not None else self._say_s
-        if next_s is not None:
-            return max(0.0, next_s - time.monotonic()) + _LATE_S
-        if self._given.verdict is Verdict.UNKNOWN:
-            return None
-        return max(0.0, self._client.policy.max_age_s - self._client.latest().age_s) + _LATE_S
-
-
-class Readings(_Queue):
-    """Iterator for one thread; ends when the client is closed."""
-
-    def __init__(self, client: TransformClient, depth: int) -> None:
-        super().__init__(client, depth)
-        self._news = threading.Event()
-
-    def wake(self) -> None:
         self._news.set()
-
-    def __iter__(self) -> Self:
-        return self
+        if (waiting := self._waiting) is not None:
+            loop, event = waiting
+            with contextlib.suppress(RuntimeError):  # its event loop has ended, and with it the wait
+                loop.call_soon_threadsafe(event.set)
 
     def __next__(self) -> Reading:
         while not self._client.closed:
@@ -287,32 +304,49 @@ class Readings(_Queue):
                 self._news.wait(self._patience_s())
         raise StopIteration
 
-
-class AsyncReadings(_Queue):
-    """Asynchronous iterator for one task of asyncio; ends when the client is closed.
-
-    A cancelled wait loses nothing: the next ``anext`` continues.
-    """
-
-    def __init__(self, client: TransformClient, depth: int) -> None:
-        super().__init__(client, depth)
-        self._loop = asyncio.get_running_loop()
-        self._news = asyncio.Event()
-
-    def wake(self) -> None:
-        with contextlib.suppress(RuntimeError):  # its event loop has ended, and with it the wait
-            self._loop.call_soon_threadsafe(self._news.set)
-
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> Reading:
+        event = asyncio.Event()
+        self._waiting = asyncio.get_running_loop(), event
         while not self._client.closed:
-            self._news.clear()
+            event.clear()
             if (reading := self._take()) is not None:
                 return reading
             if not self._client.closed:
                 with contextlib.suppress(TimeoutError):  # then the next check is due
                     async with asyncio.timeout(self._patience_s()):
-                        await self._news.wait()
+                        await event.wait()
         raise StopAsyncIteration
+
+    def _take(self) -> Reading | None:
+        """The next reading if there is one."""
+        if self._entries:
+            self._look_s = self._say_s = None
+            self._given = self._client.judge(self._entries.popleft())
+            return self._given
+        if self._given.verdict is not Verdict.UNKNOWN and (now := self._client.latest()).verdict is Verdict.UNKNOWN:
+            self._given = now
+            return now
+        return self._silence()
+
+    def _silence(self) -> Reading | None:
+        """A reading that says why there is no first message, when it is due."""
+        if self._look_s is not None and steady_s() >= self._look_s:
+            self._look_s, self._say_s = None, steady_s() + _LOOK_AROUND_S
+            self._client.look_around()
+        elif self._say_s is not None and steady_s() >= self._say_s:
+            self._say_s = None
+            self._given = self._client.latest()
+            return self._given
+        return None
+
+    def _patience_s(self) -> float | None:
+        """Time until the next check if nothing arrives, s; None: no check."""
+        next_s = self._look_s if self._look_s is not None else self._say_s
+        if next_s is not None:
+            return max(0.0, next_s - steady_s()) + _LATE_S
+        if self._given.verdict is Verdict.UNKNOWN:
+            return None
+        return max(0.0, self._client.policy.max_age_s - self._client.latest().age_s) + _LATE_S

@@ -45,7 +45,7 @@ from gripmon.simulate import (
 from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
 
 if TYPE_CHECKING:
-    from gripmon.client import Client
+    from gripmon.client import Reading, TransformClient
     from gripmon.daemon.pace import Pace
 
 _ZENOH_PORT = 7447
@@ -303,16 +303,18 @@ class _Receiver(AbstractContextManager["_Receiver"]):
 
     def __init__(self, config: Config, step: Callable[[], None]):
         self.count = 0
+        self._last_seq = -1
         self._config = config
         self._step = step
-        self._client: Client | None = None
+        self._client: TransformClient | None = None
 
     def connect(self) -> None:
         """Join the network and wait until the monitor appears."""
-        from gripmon.client import Client
+        from gripmon.client import TransformClient
 
         settings = self._config.settings
-        self._client = Client(settings.robot, settings.camera_name, connect=settings.publish.listen, depth=1024)
+        where = settings.publish.listen
+        self._client = TransformClient(settings.robot, settings.camera_name, connect=where, depth=1024)
         self._client.on_transform(self._arrived)
         deadline_s = time.monotonic() + _CONNECT_S
         while not self._client.alive(timeout_s=0.2) and time.monotonic() < deadline_s:
@@ -322,9 +324,11 @@ class _Receiver(AbstractContextManager["_Receiver"]):
         if self._client is not None:
             self._client.close()
 
-    def _arrived(self, _record: FrameRecord) -> None:
-        self.count += 1
-        self._step()
+    def _arrived(self, reading: Reading) -> None:
+        if reading.seq != self._last_seq:  # not one that says that nothing came
+            self._last_seq = reading.seq
+            self.count += 1
+            self._step()
 
 
 def _summarise(out: Path, simulator: Simulator, received: int, *, live: bool) -> DemoSummary | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from gripmon.client import MonitorName
-from gripmon.client.inbox import Inbox, Sent
+from gripmon.client.age import Sent
+from gripmon.client.inbox import Inbox
 from gripmon.model.records import ClockReading
 
 HOUR_NS = 3600 * 10**9

@@ -1,7 +1,7 @@
 // May a controller move by the newest transform?  The rules of "Messages on the wire" for a program in C++17.
 //
 // The messages alone: they come by Zenoh's own C++ library.  Times are all of one steady clock of this process
-// (std::chrono::steady_clock), in ns.  JSON: nlohmann/json.
+// that goes on while the machine is suspended (see "How old a transform is"), in ns.  JSON: nlohmann/json.
 //
 //   gripmon/<robot>/<camera>/alive/*          liveliness subscriber with history: there(id), gone(id); the key's end
 //   gripmon/<robot>/<camera>/transform        subscriber, ring of a few: transform(payload, attachment, now)

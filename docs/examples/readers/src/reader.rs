@@ -1,7 +1,7 @@
 //! May a controller move by the newest transform?  The rules of "Messages on the wire" for a program in Rust.
 //!
 //! The messages alone: they come by the crate `zenoh`.  Times are all of one steady clock of this process
-//! (`std::time::Instant`), in ns.
+//! that goes on while the machine is suspended (see "How old a transform is"), in ns.
 //!
 //! ```text
 //! gripmon/<robot>/<camera>/alive/*          liveliness subscriber with history: there(id), gone(id); the key's end

@@ -1,9 +1,8 @@
-"""All alerts of all monitors, and monitors that appear or vanish: each once, in one file of JSON lines."""
+"""``gripmon watch --alerts``: all alerts, and monitors that appear or vanish, each once, printed and in one file."""
 
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections import deque
 from pathlib import Path
@@ -11,12 +10,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from gripmon.client.fleet import MonitorStatus
-from gripmon.client.network import MonitorName
+from gripmon.client import MonitorName, MonitorStatus
 from gripmon.model.records import AlertRecord
 
-_WAITING_MOST = 100_000  # lines kept while the file or pipe can't be written; beyond it the oldest are lost
-_LOOK_BACK_BYTES = 16 << 20
+WAITING_MOST = 100_000
+"""Lines kept while the file or pipe can't be written, and read from its end: beyond it the oldest are lost."""
 
 
 class Event(NamedTuple):
@@ -30,27 +28,29 @@ class Event(NamedTuple):
 
 
 class AlertLog:
-    """Accepts events in any thread (callbacks of :class:`gripmon.client.Fleet`); :meth:`write`, called in one thread,
-    appends them to the file.
+    """Accepts events in any thread; :meth:`write`, called in one thread, appends them to the file as JSON lines.
 
-    The file is opened for every write, so that it may be moved away and the disk may be full temporarily.  Lines that
-    are in its last 16 MiB already are not written again: a monitor repeats its last alerts to late subscribers.
+    The file is opened for every write: it may be moved away (logrotate needs no signal), and its disk full for a while.
+    Lines at its end are not written again: a monitor repeats its last alerts to late subscribers.
     """
 
     def __init__(self, path: Path | None) -> None:
         """Raises OSError if the file is there and can't be read."""
         self._path = path
-        self._lock = threading.Lock()  # guards the next attribute against the callbacks' threads
-        self._new: deque[Event] = deque(maxlen=_WAITING_MOST)
-        self._waiting: deque[bytes] = deque(maxlen=_WAITING_MOST)
+        self._new: deque[Event] = deque(maxlen=WAITING_MOST)
+        self._waiting: deque[bytes] = deque(maxlen=WAITING_MOST)
         self._failure = ""
-        self._written = set() if path is None or not path.is_file() else set(_last_lines(path))
+        self._written: set[bytes] = set()
+        if path is not None and path.is_file():
+            with path.open("rb") as file:
+                self._written = {line.rstrip(b"\n") for line in deque(file, maxlen=WAITING_MOST)}
 
     def alert(self, name: MonitorName, record: AlertRecord, payload: bytes) -> None:
         """An alert arrived, with its JSON payload."""
         line = msgspec.json.format(payload, indent=-1)
         what = f"{record.kind} {record.event}" if record.alert_id else str(record.kind)
-        self._add(Event(line, name, record.stamp_ns, what, record))
+        if line not in self._written:
+            self._new.append(Event(line, name, record.stamp_ns, what, record))
 
     def presence(self, status: MonitorStatus) -> None:
         """A monitor has appeared or vanished, which it can't report itself."""
@@ -58,31 +58,24 @@ class AlertLog:
         what = "appeared" if status.gone_since_ns is None else "vanished"
         (robot, camera), schema = status.name, "gripmon.presence/1"
         values = {"schema": schema, "robot": robot, "camera": camera, "stamp_ns": stamp_ns, "event": what}
-        self._add(Event(msgspec.json.encode(values), status.name, stamp_ns, what, None))
+        self._new.append(Event(msgspec.json.encode(values), status.name, stamp_ns, what, None))
 
     def write(self) -> tuple[list[Event], str]:
         """Append all new events; returns them, and why the file can't be written (empty if it can, or if the reason was
         returned before).  What could not be written is retried the next time.
         """
-        with self._lock:
-            new, self._new = list(self._new), deque(maxlen=_WAITING_MOST)
+        new = [self._new.popleft() for _ in range(len(self._new))]
         if self._path is None:
             return new, ""
         self._waiting.extend(event.line for event in new)
-        failure = ""
+        before, self._failure = self._failure, ""
         try:
             if self._waiting:
                 _append(self._path, b"".join(line + b"\n" for line in self._waiting))
             self._waiting.clear()
         except OSError as error:
-            failure = error.strerror or str(error)
-        known, self._failure = self._failure, failure
-        return new, failure if failure != known else ""
-
-    def _add(self, event: Event) -> None:
-        with self._lock:
-            if event.line not in self._written:
-                self._new.append(event)
+            self._failure = error.strerror or str(error)
+        return new, self._failure if self._failure != before else ""
 
 
 def _append(path: Path, data: bytes) -> None:
@@ -99,9 +92,3 @@ def _append(path: Path, data: bytes) -> None:
         except OSError:
             file.truncate(size)
             raise
-
-
-def _last_lines(path: Path) -> list[bytes]:
-    with path.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - _LOOK_BACK_BYTES))
-        return file.read().split(b"\n")
