@@ -17,7 +17,7 @@ from gripmon.model.records import Verdict
 
 TEXT = (Path(__file__).resolve().parent.parent / "docs" / "howto" / "client.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-SERVO, REQUIRE, ITERATE, ASYNCIO, CALLBACK, FLEET = EXAMPLES
+SERVO, REQUIRE, ITERATE, ASYNCIO, CALLBACK, ASK, FLEET = EXAMPLES
 
 
 class Arm:
@@ -85,6 +85,14 @@ def test_the_servo_loop_begins_nothing_by_a_suspect_transform():
 def test_require_says_what_there_is_not(capsys: pytest.CaptureFixture[str]):
     run(REQUIRE, Arm(), free_endpoint())
     assert re.match(r"no (connection|transform)", capsys.readouterr().out)
+
+
+def test_a_monitor_is_asked(capsys: pytest.CaptureFixture[str]):
+    endpoint = free_endpoint()
+    with remote_monitor(robot="arm1", listen=[endpoint]):
+        run(ASK, Arm(), endpoint)
+    told = capsys.readouterr().out
+    assert "MonitorName(robot='arm1', camera='wrist')" in told and "StateRecord(robot='arm1'" in told
 
 
 def test_the_fleet_is_printed(capsys: pytest.CaptureFixture[str]):
