@@ -19,9 +19,11 @@ from gripmon.cli.common import (
     check_file,
     positive_number,
 )
-from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.errors import InputError, NoResultError, input_errors
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from gripmon.cli.alert_log import AlertLog
     from gripmon.client import Fleet, MonitorStatus
 
@@ -29,10 +31,13 @@ _OPTIONS = f"""
 {NETWORK_OPTIONS.format("a monitor's").strip()}
 --alerts      print the alerts instead of the table
 --out FILE    with --alerts: append them to this file, JSON lines
+--mount       how one camera must be moved to stand as at its reference
+--robot NAME  with --mount: the robot; needed if there are several
+--camera NAME  with --mount: its camera; needed if it has several
 --transforms  subscribe to all transforms for rate and age
 --once        print the table once, after --seconds, and end
 --json        JSON lines instead of text
---period S    time between two tables (s); default: 1
+--period S    time between two tables (s); default: 1, with --mount 0.3
 --seconds S   end after this time (s); with --once 3 by default
 """
 
@@ -46,17 +51,18 @@ _EXAMPLES = """\
   gripmon watch
   gripmon watch --once --connect tcp/10.0.0.5:7447
   gripmon watch --alerts --out fleet-alerts.jsonl
+  gripmon watch --mount --robot arm1
   gripmon watch --web --zenoh-config operator.json5
 
-exit codes: 0 done (--once, --seconds); 2 wrong usage; 3 with --once: no monitor is on the network;
-130 Ctrl-C"""
+exit codes: 0 done (--once, --seconds); 2 wrong usage; 3 with --once: no monitor is on the network, with
+--mount: it doesn't know how its camera stands; 130 Ctrl-C"""
 
 _ALERT_PERIOD_S = 0.2
 
 
 @Command(
     "watch", "a live table of all monitors, or their alerts", _OPTIONS, _EXAMPLES, {"the page": (None, _PAGE)},
-    period={"type": positive_number, "default": 1.0}, seconds=positive_number, port=PAGE_PORT,
+    period=positive_number, seconds=positive_number, port=PAGE_PORT,
 )  # fmt: skip
 def watch(arguments: Arguments) -> None:
     """A live table of all monitors on the network, the worst first: those that are gone, silent or have no
@@ -74,6 +80,11 @@ def watch(arguments: Arguments) -> None:
     when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once.  An alert has
     the time of its frame: for recorded or simulated frames, the recording's own clock.
 
+    With --mount it shows for one camera, again and again, how its mount must be turned and shifted to stand
+    as at the reference: six numbers with bars in the camera's own directions, green within the alert limit,
+    and what to do first. The reference is the newest one that a person let in, not one that the monitor made
+    itself after a knock.
+
     With --web the same is a page, with each monitor's image.  Its buttons send the commands of gripmon
     send: if a router has rules, they need an operator's certificate (--zenoh-config).
     """
@@ -82,6 +93,10 @@ def watch(arguments: Arguments) -> None:
     if arguments.web:
         _serve(arguments, joined)
         return
+    if arguments.mount:
+        _mount(arguments, joined)
+        return
+    arguments.refuse(("robot", "camera"), "applies only to one mount; add --mount")
     arguments.refuse(("address", "no_browser"), "applies only to the page; add --web")
     if arguments.out and not arguments.alerts:
         raise InputError("watch: --out is for alerts; add --alerts, or redirect the output of --json")
@@ -93,6 +108,7 @@ def watch(arguments: Arguments) -> None:
     heard: dict[str, Any] = {} if log is None else {"on_alert": log.alert, "on_presence": log.presence}
     with arguments.network_errors():
         opened = Fleet(**joined, transforms=arguments.transforms, **heard)
+    period_s = arguments.period or 1.0
     with opened as fleet:
         seconds = 3.0 if arguments.once and arguments.seconds is None else arguments.seconds
         end_s = None if seconds is None else time.monotonic() + seconds
@@ -102,17 +118,61 @@ def watch(arguments: Arguments) -> None:
             time.sleep(seconds or 0.0)
             _show_once(fleet, arguments)
         elif arguments.json:
-            _repeat(lambda: _print_json(fleet), arguments.period, end_s)
+            _repeat(lambda: _print_json(fleet), period_s, end_s)
         elif sys.stdout.isatty():
-            _live(fleet, arguments.period, end_s)
+            _live(lambda *size: fleet_table.table(_sorted(fleet), _fault(fleet), *size), period_s, end_s)
         else:
-            _repeat(_Changes(fleet).show, arguments.period, end_s)
+            _repeat(_Changes(fleet).show, period_s, end_s)
+
+
+def _mount(arguments: Arguments, joined: dict[str, Any]) -> None:
+    arguments.refuse(("alerts", "out", "transforms"), "has no effect beside --mount; leave it out")
+    arguments.refuse(("address", "no_browser"), "applies only to the page; add --web")
+    from gripmon.cli.mount_view import PERIOD_S, MountView, only_monitor, plain
+    from gripmon.client import TransformClient
+
+    with arguments.network_errors(), input_errors("watch"):
+        name = only_monitor(joined, arguments.robot, arguments.camera)
+        opened = TransformClient(*name, **joined)
+    with opened as client:
+        view, said = MountView(client, name), [""]
+
+        def tell() -> None:
+            line = view.look().line()
+            if arguments.json:
+                _print_line(view.as_data())
+            elif line != said[0]:
+                said[0] = line
+                print(f"{fleet_table.clock(time.time_ns())}  {line}", flush=True)
+
+        if arguments.once:
+            end_s = time.monotonic() + (arguments.seconds or 3.0)
+            while not view.look().measured and time.monotonic() < end_s:
+                time.sleep(PERIOD_S)
+            if not view.measured:
+                raise NoResultError(f"watch: {view.line()}")
+            if arguments.json:
+                _print_line(view.as_data())
+            else:
+                print(plain(view.rows()))
+            return
+        until_s = None if arguments.seconds is None else time.monotonic() + arguments.seconds
+        if not arguments.json and sys.stdout.isatty():
+            _live(lambda _height, _width: _lines(view.look().rows()), arguments.period or PERIOD_S, until_s)
+        else:
+            _repeat(tell, arguments.period or PERIOD_S, until_s)
+
+
+def _lines(rows: list[tuple[str, str]]) -> RenderableType:
+    from rich.console import Group
+    from rich.text import Text
+
+    return Group(*(Text(text, style=style) for text, style in rows))  # text, not markup: it comes from the network
 
 
 def _serve(arguments: Arguments, joined: dict[str, Any]) -> None:
-    arguments.refuse(
-        ("once", "json", "alerts", "out", "transforms", "seconds"), "has no effect beside --web; leave it out"
-    )
+    of_the_terminal = ("once", "json", "alerts", "out", "transforms", "seconds", "mount", "robot", "camera")
+    arguments.refuse(of_the_terminal, "has no effect beside --web; leave it out")
     from gripmon.client import Fleet
     from gripmon.daemon.fleet_page import FleetSite
     from gripmon.teach.page_server import ADDRESS, serve
@@ -183,26 +243,30 @@ def _show_once(fleet: Fleet, arguments: Arguments) -> None:
 
 
 def _print_json(fleet: Fleet) -> None:
-    import msgspec
-
     values = {
         "stamp_ns": time.time_ns(),
         "fault": fleet.fault(),
         "unreadable": fleet.unreadable,
         "monitors": [fleet_table.as_data(status) for status in _sorted(fleet)],
     }
+    _print_line(values)
+
+
+def _print_line(values: dict[str, Any]) -> None:
+    import msgspec
+
     print(msgspec.json.encode(values).decode(), flush=True)
 
 
-def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
+def _live(picture: Callable[[int, int], RenderableType], period_s: float, end_s: float | None) -> None:
+    """Redraw what ``picture`` makes for a terminal of that height and width."""
     from rich.console import Console
     from rich.live import Live
 
     console = Console()
 
     def draw() -> None:
-        height, width = console.size.height, console.size.width
-        live.update(fleet_table.table(_sorted(fleet), _fault(fleet), height, width), refresh=True)
+        live.update(picture(console.size.height, console.size.width), refresh=True)
 
     with Live(console=console, auto_refresh=False, screen=True) as live:
         _repeat(draw, period_s, end_s)

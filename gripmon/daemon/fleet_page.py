@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from gripmon import __version__
 from gripmon.client import Ambiguous, Condition, Fleet, MonitorName, MonitorStatus, NotCarriedOut, trouble
+from gripmon.daemon.mount import MountView, view_of
 from gripmon.daemon.overlay import overlay
 from gripmon.model.records import CommandName, CommandReply, StandingAlert
 from gripmon.teach.messages import BadRequest, Request
@@ -24,7 +25,9 @@ CARDS_MOST = 60
 """Monitors shown at a time, the worst ones: as many as a person can look through.  *Find* shows others."""
 PICTURE_PX = 640
 """Columns of a picture: as wide as a card on a large screen."""
-_KEPT_S = 8.0  # a picture is reused: the page asks every 10 s, and several pages must not load a monitor more than one
+# A picture is reused: the page asks every 10 s, or twice a second while somebody moves the camera, and several pages
+# must not load a monitor more than one.
+_KEPT_S, _KEPT_MOVING_S = 8.0, 0.4
 _PICTURES_KEPT = 4 * CARDS_MOST
 _AT_ONCE = 4  # concurrent snapshots, a PNG of some megabytes each
 _ANSWER_S = 5.0
@@ -90,11 +93,12 @@ class FleetView(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Picture(msgspec.Struct, frozen=True):
-    """JPEG with the overlay, capture time of its frame, and verdict of its transform."""
+    """JPEG with the overlay, capture time of its frame, verdict of its transform, and how the camera stands."""
 
     jpeg: bytes
     stamp_ns: int
     verdict: str
+    mount: MountView | None = None
 
 
 class FleetSite:
@@ -102,14 +106,14 @@ class FleetSite:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._files = web_files("fleet.html", "style.css", "fleet.css", "icon.svg", "fleet.js", "server.js")
-        self._pictures: dict[tuple[MonitorName, str], tuple[float, Picture | str]] = {}
-        self._under_way: dict[tuple[MonitorName, str], threading.Lock] = {}
+        self._files = web_files("fleet.html", "style.css", "fleet.css", "icon.svg", "fleet.js", "mount.js", "server.js")
+        self._pictures: dict[tuple[MonitorName, str, bool], tuple[float, Picture | str]] = {}
+        self._under_way: dict[tuple[MonitorName, str, bool], threading.Lock] = {}
         self._lock = threading.Lock()  # guards both
         self._slots = threading.BoundedSemaphore(_AT_ONCE)
 
     def get(self, path: str) -> Served | None:
-        """The page's files, ``fleet?find=…``, ``picture?robot=…&camera=…&id=…``."""
+        """The page's files, ``fleet?find=…``, ``picture?robot=…&camera=…&id=…``, for the mount ``&mount=1``."""
         path, _, query = path.partition("?")
         if path in self._files:
             return self._files[path]
@@ -118,7 +122,8 @@ class FleetSite:
             return msgspec.json.encode(self.shown(asked.get("find", ""))), "application/json"
         if path == "picture":
             name = MonitorName(asked.get("robot", ""), asked.get("camera", ""))
-            return msgspec.json.encode(self.picture(name, asked.get("id", ""))), "application/json"
+            picture = self.picture(name, asked.get("id", ""), mount="mount" in asked)
+            return msgspec.json.encode(picture), "application/json"
         return None
 
     def post(self, path: str) -> Action | None:
@@ -153,10 +158,12 @@ class FleetSite:
         reply, _ = self._ask(name, CommandName(order.name), order.argument, order.monitor_id)
         return CommandOutcome(reply.done, _short(reply.text))
 
-    def picture(self, name: MonitorName, monitor_id: str) -> Picture:
-        """Its picture, at most 8 s old.  Raises :class:`BadRequest`, which says why there is none."""
+    def picture(self, name: MonitorName, monitor_id: str, *, mount: bool = False) -> Picture:
+        """Its picture, at most 8 s old; for ``mount`` at most 0.4 s, and with the outline at the reference.  Raises
+        :class:`BadRequest`, which says why there is none.
+        """
         self._known(name, monitor_id)
-        key = name, monitor_id
+        key = name, monitor_id, mount
         with self._lock:
             if key not in self._under_way and len(self._under_way) >= _PICTURES_KEPT:
                 self._under_way.clear()
@@ -164,10 +171,10 @@ class FleetSite:
             one_at_a_time = self._under_way.setdefault(key, threading.Lock())
         with one_at_a_time:
             made_s, found = self._pictures.get(key, (0.0, ""))
-            if not found or time.monotonic() - made_s > _KEPT_S:
+            if not found or time.monotonic() - made_s > (_KEPT_MOVING_S if mount else _KEPT_S):
                 try:
                     with self._slots:
-                        found = self._made(name, monitor_id)
+                        found = self._made(name, monitor_id, mount=mount)
                 except BadRequest as error:
                     found = str(error)
                 self._pictures[key] = time.monotonic(), found
@@ -175,7 +182,7 @@ class FleetSite:
             raise BadRequest(found)
         return found
 
-    def _made(self, name: MonitorName, monitor_id: str) -> Picture:
+    def _made(self, name: MonitorName, monitor_id: str, *, mount: bool) -> Picture:
         reply, data = self._ask(name, CommandName.SNAPSHOT, "", monitor_id)
         snapshot = reply.snapshot
         if not reply.done or snapshot is None:
@@ -183,8 +190,9 @@ class FleetSite:
         image = None if not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise BadRequest("its newest frame has no image")
-        jpeg = overlay(np.asarray(image), snapshot.record, snapshot.outlines_px, PICTURE_PX)
-        return Picture(jpeg, snapshot.record.stamp_ns, snapshot.record.verdict.value)
+        record, wanted = snapshot.record, snapshot.reference_px if mount else None
+        jpeg = overlay(np.asarray(image), record, snapshot.outlines_px, PICTURE_PX, wanted)
+        return Picture(jpeg, record.stamp_ns, record.verdict.value, view_of(reply.mount) if mount else None)
 
     def _known(self, name: MonitorName, monitor_id: str) -> MonitorStatus:
         """The status of a known monitor; names invented by a request are refused."""

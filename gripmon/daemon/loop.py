@@ -12,6 +12,7 @@ from typing import Unpack
 import msgspec
 
 from gripmon.daemon.keeping import StateKeeper
+from gripmon.daemon.mount import mount_of, to_stand_at
 from gripmon.daemon.neighbours import JawFeed
 from gripmon.daemon.snapshots import Newest
 from gripmon.daemon.supervised import Loop, Parts
@@ -24,6 +25,7 @@ from gripmon.model.records import (
     FrameRecord,
     Image,
     MonitorState,
+    State,
     unmeasured_record,
     withheld,
 )
@@ -124,7 +126,14 @@ class Daemon(Loop):
         return frame, record, ""
 
     def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
-        return self._monitor.command(command, stamp_ns)
+        answer, reports = self._monitor.command(command, stamp_ns), self._reports
+        if answer.monitor is None or reports.alert_limit_m is None or reports.alert_limit_rad is None:
+            return answer
+        # A frame from before the camera fell silent says nothing about where somebody has moved it since.
+        newest = None if self._watch.state is State.STALE or self._newest is None else self._newest.record
+        limits = reports.alert_limit_m, reports.alert_limit_rad
+        mount = mount_of(newest, to_stand_at(answer.monitor.references), *limits)
+        return msgspec.structs.replace(answer, mount=mount)
 
     def _settle(self, answer: CommandReply | None) -> CommandReply | None:
         """What is reported as done must persist after a crash."""

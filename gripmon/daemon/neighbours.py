@@ -21,7 +21,7 @@ class Reports:
     """Values for the state message that the loop doesn't know itself; called in its thread, and must not block.
 
     ``faults`` return what is wrong in a few words, empty or None while nothing is; ``unsent`` counts transforms that
-    could not be sent, ``malformed`` invalid messages received; ``alert_limit_m`` as configured; ``others``: ids of
+    could not be sent, ``malformed`` invalid messages received; the alert limits as configured; ``others``: ids of
     other monitors with this name.
     """
 
@@ -29,4 +29,5 @@ class Reports:
     unsent: Callable[[], int] = int
     malformed: Callable[[], int] = int
     alert_limit_m: float | None = None
+    alert_limit_rad: float | None = None
     others: Callable[[], tuple[str, ...]] = tuple

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, Image, Outlines
 from gripmon.teach.drawing import Canvas, Colour
@@ -15,22 +14,25 @@ from gripmon.teach.snapping import outlines_px
 _POINTS = 17  # per edge, which the lens bends
 _OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255)}
 _LOST: Colour = (80, 80, 255)
+_REFERENCE: Colour = (255, 255, 255)
 _CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
 _QUALITY = 85  # of JPEG, percent
 
 
-def outlines_of(camera: Camera, gripper: Gripper, record: FrameRecord) -> Outlines:
-    """The gripper's visible edges where the record measured it, px; none without a transform."""
-    if record.measured_T is None:
+def outlines_of(camera: Camera, gripper: Gripper, cam_T_grip: Array | None, jaw_opening_m: float | None) -> Outlines:
+    """The gripper's visible edges, px; none without a transform."""
+    if cam_T_grip is None:
         return ()
-    opening_m = record.jaw_opening_m if gripper.has_jaw else None
-    lines = outlines_px(camera, gripper, from_record(record.measured_T), opening_m, _POINTS).values()
+    opening_m = jaw_opening_m if gripper.has_jaw else None
+    lines = outlines_px(camera, gripper, cam_T_grip, opening_m, _POINTS).values()
     return tuple(tuple((round(float(u), 2), round(float(v), 2)) for u, v in line) for line in lines)
 
 
-def overlay(image: Image, record: FrameRecord, outlines: Outlines, width_px: int) -> bytes:
+def overlay(
+    image: Image, record: FrameRecord, outlines: Outlines, width_px: int, reference_px: Outlines | None = None
+) -> bytes:
     """JPEG about ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners,
-    yellow if they were used, red if not.
+    yellow if they were used, red if not; ``reference_px``: instead of these, white, where the edges are to be.
     """
     scale = min(1.0, width_px / image.shape[1])
     smaller = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -42,7 +44,9 @@ def overlay(image: Image, record: FrameRecord, outlines: Outlines, width_px: int
 
     for line_px in outlines:
         canvas.line(placed(line_px), _OUTLINE.get(record.verdict.value, _LOST), 2)
-    for corner in record.corners:
+    for line_px in reference_px or ():
+        canvas.line(placed(line_px), _REFERENCE, 1)
+    for corner in record.corners if reference_px is None else ():
         if corner.uv_px is not None:
             canvas.circle(placed(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)
     return bytes(cv2.imencode(".jpg", canvas.picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())

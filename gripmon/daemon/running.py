@@ -18,10 +18,10 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import JawFeed, Reports
-from gripmon.daemon.snapshots import Snapshots
+from gripmon.daemon.snapshots import OutlinesOf, Snapshots, no_outlines
 from gripmon.daemon.supervised import Parts
 from gripmon.daemon.watch import DaemonSettings
-from gripmon.model.records import FrameRecord, Image, Outlines
+from gripmon.model.records import Image
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
 
@@ -37,7 +37,7 @@ def run(
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     duration_s: float | None = None,
-    outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
+    outlines: OutlinesOf = no_outlines,
     odd_about: Callable[[Image], str | None] = lambda _: None,
     **parts: Unpack[Parts],
 ) -> int:
@@ -63,7 +63,7 @@ def _closing(
     lines: Path | None,
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
-    outlines: Callable[[FrameRecord], Outlines] = lambda _: (),
+    outlines: OutlinesOf = no_outlines,
 ) -> Iterator[None]:
     """Adds the file for lines to the outputs, and the faults of all these and the snapshots to ``parts``.
 

@@ -16,10 +16,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.daemon.mount import at_reference, to_stand_at
 from gripmon.io.publish.commands import PendingCommand
 from gripmon.io.publish.presence import CLOSE_WITHIN_S
 from gripmon.model.errors import in_short
+from gripmon.model.geometry import from_record
 from gripmon.model.records import (
+    Array,
     CommandError,
     CommandFault,
     CommandReply,
@@ -42,6 +45,15 @@ _NICENESS = 10  # the loop has priority
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
+OutlinesOf = Callable[[Array | None, float | None], Outlines]
+"""The gripper's visible edges for a ``cam_T_grip`` (4, 4) and a jaw opening (m); none without a transform."""
+
+
+def no_outlines(_cam_T_grip: Array | None, _jaw_opening_m: float | None) -> Outlines:
+    """For a camera without a gripper."""
+    return ()
+
+
 class Newest(NamedTuple):
     """The newest frame, its record, and when it was judged (monotonic)."""
 
@@ -58,9 +70,9 @@ class _Job(NamedTuple):
 
 
 class Snapshots:
-    """Completes replies in a separate thread, started on demand; ``outlines``: the gripper's outlines for a record."""
+    """Completes replies in a separate thread, started on demand."""
 
-    def __init__(self, outlines: Callable[[FrameRecord], Outlines] = lambda _: ()) -> None:
+    def __init__(self, outlines: OutlinesOf = no_outlines) -> None:
         self._outlines = outlines
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
@@ -92,20 +104,25 @@ class Snapshots:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # of this thread alone, on Linux
         while (job := self._jobs.get()) is not None:
             try:
-                _complete(job, self._outlines(job.newest.record))
+                _complete(job, self._outlines)
             except Exception as error:  # noqa: BLE001  reported to the sender
                 _log.debug("snapshot", exc_info=error)
                 job.asked.answer(CommandError(CommandFault.INTERNAL, in_short(error)))
 
 
-def _complete(job: _Job, outlines: Outlines) -> None:
+def _complete(job: _Job, outlines: OutlinesOf) -> None:
     frame, record, judged_s = job.newest
     image, data, summary = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
     if (encoded := encode(frame.image)) is not None:
         image, data = encoded
         summary = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
     age_s = job.asked_s - judged_s
-    snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image, outlines)
+    measured = None if record.measured_T is None else from_record(record.measured_T)
+    wanted = None
+    if job.reply.mount is not None and job.reply.monitor is not None:
+        wanted = at_reference(record, to_stand_at(job.reply.monitor.references))
+    lines, wanted_lines = (outlines(pose, record.jaw_opening_m) for pose in (measured, wanted))
+    snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image, lines, wanted_lines)
     text = f"frame {frame.seq}, {age_s:.2f} s old, {record.state}, transform {record.verdict}: {summary}"
     job.asked.answer(msgspec.structs.replace(job.reply, text=text, snapshot=snapshot), data)
 

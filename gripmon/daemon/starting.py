@@ -27,7 +27,7 @@ from gripmon.io.sources import Source
 from gripmon.judge.statefile import StateFile, StateFileError
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, MonitorState, Outlines, Severity
+from gripmon.model.records import Alert, AlertKind, Array, Cause, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
 from gripmon.monitor import warm_up
 from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, ViewSettings
@@ -135,7 +135,7 @@ def run_monitor(
         if live is not None:
             live.open(viewed)
         opened.pop_all()  # from here on the daemon closes them
-        reports = with_source(network.reports, source)
+        reports, policy = with_source(network.reports, source), settings.monitor.policy
         return run(
             monitor,
             source=source,
@@ -148,19 +148,21 @@ def run_monitor(
             jaw=network.jaw,
             keeper=keeper,
             commands=network.commands,
-            reports=dataclasses.replace(reports, alert_limit_m=settings.monitor.policy.alert_limit_m),
+            reports=dataclasses.replace(
+                reports, alert_limit_m=policy.alert_limit_m, alert_limit_rad=policy.alert_limit_rad
+            ),
             notices=_notices(kept),
             duration_s=duration_s,
             stop=stop,
-            outlines=lambda record: _outlines(config, record),
+            outlines=lambda transform, opening_m: _outlines(config, transform, opening_m),
             odd_about=lambda image: unlike_light(config, image),
         )
 
 
-def _outlines(config: Config, record: FrameRecord) -> Outlines:
+def _outlines(config: Config, cam_T_grip: Array | None, jaw_opening_m: float | None) -> Outlines:
     from gripmon.daemon.overlay import outlines_of  # the drawing code is loaded only when needed
 
-    return outlines_of(config.camera, config.gripper, record)
+    return outlines_of(config.camera, config.gripper, cam_T_grip, jaw_opening_m)
 
 
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:

@@ -15,13 +15,15 @@ import cv2
 import msgspec
 import numpy as np
 
-from gripmon.client import Ambiguous, Client, NotCarriedOut
+from gripmon.client import Ambiguous, NotCarriedOut, TransformClient
 from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.mount import MountView, view_of
 from gripmon.daemon.overlay import outlines_of, overlay
 from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
+from gripmon.model.geometry import from_record
 from gripmon.model.images import read_image
-from gripmon.model.records import FrameRecord
+from gripmon.model.records import FrameRecord, Mount
 from gripmon.teach.messages import BadRequest
 
 _LINES = 200
@@ -33,9 +35,9 @@ _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor ha
 
 
 class MonitorView(msgspec.Struct, frozen=True, kw_only=True):
-    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply, and ``bound`` on its position's error, as a
-    text; ``shown`` counts the pictures; ``lines`` of its log, the newest last; ``ended``: how it ended, None while it
-    runs or if it was never started.
+    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply, ``bound`` on its position's error, as a
+    text, and ``mount``, how the camera stands; ``shown`` counts the pictures; ``lines`` of its log, the newest last;
+    ``ended``: how it ended, None while it runs or if it was never started.
     """
 
     running: bool
@@ -45,6 +47,7 @@ class MonitorView(msgspec.Struct, frozen=True, kw_only=True):
     reason: str | None
     frame: int | None
     bound: str | None
+    mount: MountView | None
     shown: int
     lines: tuple[str, ...]
 
@@ -58,6 +61,7 @@ class MonitorProcess:
         self._threads: list[threading.Thread] = []
         self._lines: deque[str] = deque(maxlen=_LINES)
         self._record: FrameRecord | None = None
+        self._mount: Mount | None = None
         self._picture: bytes | None = None
         self._shown = 0
 
@@ -69,7 +73,7 @@ class MonitorProcess:
             raise BadRequest("the monitor is already running")
         config = load_config(self._folder / "config.yaml")
         self._lines.clear()
-        self._record = self._picture = None
+        self._record = self._picture = self._mount = None
         words = [sys.executable, "-m", "gripmon", "run", "config.yaml", "--out", "run"]
         self._process = subprocess.Popen(
             words, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
@@ -109,6 +113,7 @@ class MonitorProcess:
             reason=None if record is None else record.reason,
             frame=None if record is None else record.seq,
             bound=None if bound is None else f"{1e3 * bound.position_m:.2f} mm",
+            mount=view_of(self._mount),
             shown=self._shown,
             lines=tuple(self._lines),
         )
@@ -129,7 +134,7 @@ class MonitorProcess:
         settings = config.settings
         where = settings.publish.listen or settings.publish.connect
         try:
-            client = Client(settings.robot, settings.camera_name, connect=where)
+            client = TransformClient(settings.robot, settings.camera_name, connect=where)
         except (PublishError, ValueError) as error:
             self._lines.append(f"no picture: {error}")
             return
@@ -141,10 +146,12 @@ class MonitorProcess:
                     reply, data = None, None  # it is starting or ending
                 if reply is not None and reply.snapshot is not None:
                     seen = reply.snapshot
-                    self._record = seen.record
+                    self._record, self._mount = seen.record, reply.mount
+                    moved = reply.mount is not None and not reply.mount.within
+                    wanted = seen.reference_px if moved else None
                     image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
                     if image is not None:
-                        self._picture = overlay(np.asarray(image), seen.record, seen.outlines_px, _PICTURE_PX)
+                        self._picture = overlay(np.asarray(image), seen.record, seen.outlines_px, _PICTURE_PX, wanted)
                         self._shown += 1
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_ASK_EVERY_S)
@@ -160,6 +167,7 @@ class MonitorProcess:
             if isinstance(source, FolderSettings) and record.name is not None:
                 image, _ = read_image(config.directory / source.path / record.name)
                 if image is not None:
-                    outlines = outlines_of(config.camera, config.gripper, record)
+                    pose = None if record.measured_T is None else from_record(record.measured_T)
+                    outlines = outlines_of(config.camera, config.gripper, pose, record.jaw_opening_m)
                     self._picture = overlay(image, record, outlines, _PICTURE_PX)
                     self._shown += 1

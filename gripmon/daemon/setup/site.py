@@ -94,7 +94,7 @@ class SetupSite:
 
     def __init__(self, project: Project) -> None:
         self._project = project
-        self._files = web_files("setup.html", "style.css", "setup.css", "icon.svg", "setup.js", "server.js")
+        self._files = web_files("setup.html", "style.css", "setup.css", "icon.svg", "setup.js", "mount.js", "server.js")
         self._lock = threading.Lock()
         self._busy: str | None = None
         self._said: dict[str, tuple[Line, ...]] = {"check": tuple(project.checked())}

@@ -92,6 +92,51 @@ Outlines = tuple[tuple[tuple[float, float], ...], ...]
 """Lines in an image, each given by its points (u, v), px."""
 
 
+Three = tuple[float, float, float]
+
+
+class Mount(msgspec.Struct, frozen=True):
+    """How the camera must be moved to stand against the gripper as at a reference: the newest that a person let in, so
+    not one that the monitor made itself after a knock.
+
+    All axes are the camera's own, where it stands now: x right and y down in its picture, z where it looks.
+    """
+
+    reference_id: Annotated[str, Meta(description="the reference to stand at; it may not be the one in force")]
+    revision: Annotated[int, Meta(description="of that reference")]
+    alert_limit_m: Annotated[float, Meta(description="largest distance of the TCP from its place at the reference, m")]
+    alert_limit_rad: Annotated[float, Meta(description="largest turn against the reference, rad")]
+    reason: Annotated[
+        str, Meta(description="why nothing is known, or why what is known isn't certain; empty if the frame is valid")
+    ] = ""
+    shift_m: Annotated[
+        Three | None, Meta(description="by how much the lens must be shifted, m; null if the frame has no measurement")
+    ] = None
+    turn_rad: Annotated[
+        Three | None, Meta(description="by how much the camera must be turned about its lens: a rotation vector, rad")
+    ] = None
+    turn_limits_rad: Annotated[
+        Three | None,
+        Meta(description="turn about each axis alone that moves the TCP or the view by the alert limit, rad"),
+    ] = None
+    tcp_off_m: Annotated[
+        float | None, Meta(description="distance of the TCP from its place at the reference, in the camera frame, m")
+    ] = None
+    turned_rad: Annotated[float | None, Meta(description="angle of the whole turn, rad")] = None
+
+    @property
+    def within(self) -> bool:
+        """Whether both limits are kept."""
+        if self.tcp_off_m is None or self.turned_rad is None:
+            return False
+        return self.tcp_off_m <= self.alert_limit_m and self.turned_rad <= self.alert_limit_rad
+
+    @property
+    def placed(self) -> bool:
+        """Whether both limits are kept for certain: the camera stands as at the reference."""
+        return self.within and not self.reason
+
+
 class Snapshot(msgspec.Struct, frozen=True):
     """The newest frame: the monitor's record of it, and its image."""
 
@@ -104,6 +149,10 @@ class Snapshot(msgspec.Struct, frozen=True):
     outlines_px: Annotated[
         Outlines,
         Meta(description="the gripper's visible edges where the record's transform has them, each through its points"),
+    ] = ()
+    reference_px: Annotated[
+        Outlines,
+        Meta(description="and where they would be if the camera stood as at the reference of mount; empty if unknown"),
     ] = ()
 
 
@@ -132,6 +181,10 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
         ),
     ] = True
     monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""
+    mount: Annotated[
+        Mount | None,
+        Meta(description="answers state and snapshot: how the camera stands to the reference; null of a second camera"),
+    ] = None
 
 
 class Snapshot1(Snapshot, frozen=True):

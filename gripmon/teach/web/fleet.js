@@ -1,8 +1,9 @@
 // The page of gripmon watch --web.  All texts of monitors go into text nodes: they come from the network.
 
+import { showMount } from "./mount.js";
 import { get, post } from "./server.js";
 
-const PERIOD_MS = 1000, PICTURE_MS = 10_000, OLD_S = 25;
+const PERIOD_MS = 1000, PICTURE_MS = 10_000, MOUNT_MS = 500, OLD_S = 25;
 const $ = (selector, within = document) => within.querySelector(selector);
 const cards = new Map();   // by name and id: {root, card, picture, asked, seen, next}
 let hover = false, ended = false, last = 0;
@@ -31,12 +32,22 @@ function made(card) {
   root.addEventListener("click", (event) => {
     const button = event.target.closest("button");
     if (!button || button.disabled) return;
-    if (button.dataset.order) ask(entry, button.dataset.order, button.dataset.argument ?? "");
+    if (button.classList.contains("by-hand")) byHand(entry);
+    else if (button.dataset.order) ask(entry, button.dataset.order, button.dataset.argument ?? "");
     else if (button.classList.contains("yes")) carryOut(entry);
     else if (button.classList.contains("no")) { entry.asked = null; show(entry); }
   });
   visible.observe(root);
   return entry;
+}
+
+// While somebody moves the camera, a picture comes twice a second.
+function byHand(entry) {
+  entry.mount = !entry.mount;
+  $(".by-hand", entry.root).setAttribute("aria-pressed", entry.mount);
+  $(".mount", entry.root).hidden = true;
+  entry.next = 0;
+  loadPicture(entry);
 }
 
 function ask(entry, name, argument) {
@@ -149,7 +160,9 @@ function caption(entry, gone) {
 }
 
 async function loadPicture(entry) {
-  const { card } = entry, query = new URLSearchParams({ robot: card.robot, camera: card.camera, id: card.monitor_id });
+  if (entry.loading) return;
+  const { card, mount } = entry, query = new URLSearchParams({ robot: card.robot, camera: card.camera, id: card.monitor_id });
+  if (mount) query.set("mount", 1);
   entry.loading = true;
   entry.next = Date.now() + PICTURE_MS;
   try {
@@ -161,9 +174,18 @@ async function loadPicture(entry) {
     image.hidden = false;
     if (entry.url) URL.revokeObjectURL(entry.url);
     Object.assign(entry, { url, stamp: found.stamp_ns, verdict: found.verdict, why: "" });
-  } catch (error) { entry.why = error.message; }
+    if (mount && entry.mount) {
+      $(".mount", entry.root).hidden = !found.mount;
+      if (found.mount) showMount($(".mount", entry.root), found.mount);
+      else entry.why = "this monitor doesn't say how its camera is mounted";
+    }
+  } catch (error) {
+    entry.why = error.message;
+    $(".mount", entry.root).hidden = true;   // what it showed may no longer hold
+  }
   entry.loading = false;
   show(entry);
+  if (entry.mount && entry.root.isConnected && !ended) setTimeout(() => { if (entry.mount) loadPicture(entry); }, MOUNT_MS);
 }
 
 function arrange(shown) {

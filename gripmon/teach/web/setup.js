@@ -1,5 +1,6 @@
 // One step at a time: its form and buttons, what the camera or the monitor shows, and the result.
 
+import { showMount } from "./mount.js";
 import { get, post } from "./server.js";
 
 const $ = (selector) => document.querySelector(selector);
@@ -224,6 +225,8 @@ function showMonitor() {
   const now = state.monitor, isOne = step().kind === "run" && (now.running || now.ended !== null);
   $("#monitor").hidden = !isOne;
   if (!isOne) return;
+  $("#mount").hidden = !now.mount || !now.running;
+  if (now.mount) showMount($("#mount"), now.mount);
   const log = $("#log"), text = now.lines.join("\n");
   if (log.textContent !== text) { log.textContent = text; log.scrollTop = log.scrollHeight; }
 }

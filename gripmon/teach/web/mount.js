@@ -1,0 +1,41 @@
+// How a camera must be moved to stand as at its reference: six bars, drawn into a node that keeps them.
+
+const LIMITS_SHOWN = 3;   // on each side of a bar's middle
+
+function element(name, className = "") {
+  const node = document.createElement(name);
+  node.className = className;
+  return node;
+}
+
+function bar() {
+  const row = element("div", "move"), track = element("span", "track");
+  track.append(element("i", "allowed"), element("i", "fill"));
+  row.append(element("span", "end"), track, element("span", "end"), element("b"));
+  return row;
+}
+
+const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
+
+export function showMount(root, mount) {
+  if (!root.children.length) {
+    root.append(element("p", "target"), element("p", "first"), element("div", "moves"), element("p", "directions"));
+  }
+  const [target, first, moves, directions] = root.children;
+  root.dataset.kind = mount.placed ? "good" : mount.known ? "warn" : "bad";
+  setText(target, `To stand as at ${mount.reference}; white: where the gripper will be seen`);
+  setText(first, mount.summary);
+  setText(directions, mount.known ? `Shaded: alert limit. ${mount.directions}.` : "");
+  while (moves.children.length > mount.rows.length) moves.lastChild.remove();
+  while (moves.children.length < mount.rows.length) moves.append(bar());
+  mount.rows.forEach((row, k) => {
+    const [low, track, high, text] = moves.children[k].children, fill = track.lastChild;
+    moves.children[k].dataset.done = mount.placed || row.done;
+    setText(low, row.ends[0].split(" ")[1]);
+    setText(high, row.ends[1].split(" ")[1]);
+    setText(text, row.text);
+    const half = 50 * Math.min(1, Math.abs(row.share) / LIMITS_SHOWN);
+    fill.style.width = `${half}%`;
+    fill.style.left = `${row.share < 0 ? 50 - half : 50}%`;
+  });
+}
