@@ -6,23 +6,29 @@ The camera is moved here by its position and its three directions in the gripper
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import re
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import pytest
-from support.loopback import frame_record
+from support.commanded import Loop
+from support.loopback import frame_record, free_endpoint
 from support.meters import box_gripper
+from support.published import Published
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import pose_of, reference_of
 
+from gripmon.cli import main
 from gripmon.daemon.mount import at_reference, mount_of, to_stand_at
+from gripmon.io.wire import PublishSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import to_record
 from gripmon.model.mount import moves, summary
-from gripmon.model.records import FrameRecord, Mount, Origin, Verdict
+from gripmon.model.records import CommandName, CommandReply, FrameRecord, Mount, Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 
@@ -174,6 +180,67 @@ def test_obeying_the_words_before_the_real_monitors_eyes_puts_it_back():
     assert told.placed, summary(told)
     off = pose_of(to_record(eye.cam_T_grip))[:3, 3] - home[:3, 3]
     assert np.linalg.norm(off) < 0.3e-3  # in truth, too
+
+
+@pytest.fixture
+def asked() -> Iterator[tuple[str, list[CommandReply]]]:
+    """A monitor's endpoint, and its answer to every question: the last of the list."""
+    endpoint, home = free_endpoint(), nominal_cam_T_grip()
+    told = mount(eye_of(home).moved("turn left 1.50°").moved("shift up 0.30 mm"), home)
+    replies = [CommandReply(CommandName.STATE, True, "", "factory-1", 1, mount=told)]
+    monitor = Published(PublishSettings(listen=(endpoint,)), identified=True)
+    loop = Loop(monitor.commands, lambda _: replies[-1])
+    yield endpoint, replies
+    loop.end()
+    monitor.close()
+
+
+def test_watch_shows_it_on_a_terminal_and_to_a_program(
+    asked: tuple[str, list[CommandReply]], capsys: pytest.CaptureFixture[str]
+):
+    endpoint, replies = asked
+    watch = ["watch", "--mount", "--connect", endpoint]
+    assert main([*watch, "--once"]) == 0
+    name, first, _, *bars = capsys.readouterr().out.splitlines()
+    assert name == "arm/wrist, to stand as at factory-1 (revision 1)" and first.startswith("turn right 1.50° first: ")
+    assert len(bars) == 9
+    (turn,) = (line for line in bars if "turn right" in line)
+    left, _, right = turn.partition("|")
+    assert "█" in right and "█" not in left and " ok " not in turn
+    (shift,) = (line for line in bars if "shift down 0.30 mm" in line)
+    assert " ok shift down" in shift and "|█" in shift
+    assert main([*watch, "--once", "--json", "--robot", "arm"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [move["done"] for move in told["moves"]] == [True, True, True, True, False, True]
+    assert not told["placed"] and told["mount"]["turn_rad"][1] == pytest.approx(math.radians(1.5), rel=1e-3)
+
+    made = msgspec.structs.replace(replies[0], reference_id="recalibration-2", revision=2)
+    replies.append(made)
+    assert main([*watch, "--seconds", "1", "--period", "0.1"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1  # said once, since nothing changes
+    assert main([*watch, "--once"]) == 0
+    after = capsys.readouterr().out.splitlines()[-1]
+    assert after.endswith("gripmon send undo factory-1 --robot arm --camera wrist")
+
+
+def test_watch_says_what_keeps_it_from_telling(
+    asked: tuple[str, list[CommandReply]], capsys: pytest.CaptureFixture[str]
+):
+    endpoint, replies = asked
+    watch = ["watch", "--mount", "--once", "--seconds", "0.1", "--connect"]
+
+    def refused(*arguments: str) -> str:
+        assert main([*watch, endpoint, *arguments]) == 3
+        return capsys.readouterr().err
+
+    replies.append(msgspec.structs.replace(replies[0], mount=mount_of(None, reference_of(UPSIDE_DOWN), *LIMITS)))
+    assert refused() == "watch: arm/wrist: can't tell where the camera stands: no frame has come yet\n"
+    replies.append(msgspec.structs.replace(replies[0], mount=None))
+    assert "it doesn't say how its camera is mounted" in refused()
+    assert refused("--robot", "leg").startswith("watch: no monitor is on the network; ")
+    assert main(["watch", "--robot", "arm", "--connect", endpoint]) == 2
+    assert main([*watch, endpoint, "--alerts"]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
 
 
 def test_the_outline_is_drawn_where_the_gripper_will_be_seen():

@@ -21,13 +21,13 @@ from test_security import own_files
 
 import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
+from gripmon.client import Client, NotCarriedOut, TransformClient
 from gripmon.daemon.neighbours import Reports
 from gripmon.daemon.running import run
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.sources import FolderSettings, FolderSource, Waiting
 from gripmon.io.wire import PublishSettings
-from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
+from gripmon.model.records import CommandFault, CommandName, CommandReply, Frame, MonitorState, from_json, largest_bytes
 
 
 def picture(seq: int) -> np.ndarray:
@@ -60,7 +60,8 @@ class Running:
         run(
             Monitor(), source=ScriptedSource(items, live=True), outputs=(self.publisher,), recorder=self.recording,
             settings=DaemonSettings(state_period_s=NEVER), robot="arm", camera="wrist",
-            commands=self.publisher.commands, reports=Reports(),
+            commands=self.publisher.commands, reports=Reports(alert_limit_m=1e-3, alert_limit_rad=0.03),
+            outlines=lambda cam_T_grip, _: () if cam_T_grip is None else ((tuple(cam_T_grip[:2, 3].tolist()),),),
         )  # fmt: skip
         self.ended.set()
 
@@ -109,6 +110,29 @@ def test_the_image_is_that_of_the_frame_that_the_record_is_of(endpoint: str):
         said = f"frame {record.seq}, {reply.snapshot.age_s:.2f} s old, tracking, transform valid: 64 x 48 px, png, "
         assert reply.text.startswith(said)
     assert seqs == sorted(set(seqs)), "each time a newer one"
+
+
+def test_it_says_how_the_camera_stands_until_the_camera_is_silent(endpoint: str):
+    """And a snapshot has the outline where the gripper would be seen at the reference."""
+
+    def frames(seq: int) -> object:
+        return Waiting("unplugged") if seq > 50 else Frame(seq, 1_000 + seq, picture(seq))
+
+    with running(endpoint, frames) as daemon, TransformClient("arm", connect=[endpoint]) as client:
+        wait_until(lambda: daemon.frames > 2, "some frames")
+        reply, _ = client.snapshot(WAIT_S)
+        reference = Monitor().reference
+        assert reply.mount is not None and reply.snapshot is not None and reply.snapshot.record.cam_T_grip is not None
+        assert reply.mount.reference_id == reference.reference_id and reply.mount.shift_m is not None
+        assert reply.snapshot.outlines_px != reply.snapshot.reference_px
+        (((u, v),),) = reply.snapshot.reference_px  # type: ignore[misc]
+        assert (u, v) == pytest.approx(reference.cam_T_grip.translation_m[:2])
+
+        def silent() -> bool:
+            mount = client.send(CommandName.STATE).mount
+            return mount is not None and mount.reason == "no frame has come yet" and mount.shift_m is None
+
+        wait_until(silent, "the camera to be known to be silent")
 
 
 def test_frames_go_on_while_a_file_is_made(endpoint: str, monkeypatch: pytest.MonkeyPatch):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli.fleet_table import printable
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.mount import DIRECTIONS, Move, moves, summary
+from gripmon.model.mount import DIRECTIONS, Move, afterwards, moves, summary
 
 if TYPE_CHECKING:
     from gripmon.client import MonitorName, TransformClient
@@ -47,6 +47,7 @@ class MountView:
         self._client, self._name = client, name
         self.reply: CommandReply | None = None
         self.fault = ""
+        self._told: object = None
 
     def look(self) -> MountView:
         """Ask the monitor."""
@@ -58,7 +59,7 @@ class MountView:
         except (NotCarriedOut, Ambiguous) as error:
             self.reply, self.fault = None, printable(str(error))
         if self.reply is not None and self.reply.mount is None:
-            self.fault = "a second camera, or a monitor of an earlier version: it doesn't say how it is mounted"
+            self.fault = "it doesn't say how its camera is mounted: a monitor of an earlier version"
         return self
 
     @property
@@ -72,6 +73,14 @@ class MountView:
             return f"{printable(str(self._name))}: {self.fault}"
         rest = ", ".join(move.text for move in moves(mount))
         return printable(f"{self._name}: {summary(mount)}" + (f" | {rest}" if rest else ""))
+
+    def changed(self) -> bool:
+        """Whether it is another line than the last time, by more than a quarter of a limit."""
+        mount = None if self.reply is None else self.reply.mount
+        told = () if mount is None else moves(mount)
+        before = self._told
+        self._told = (self.fault, mount and (mount.reason, mount.placed), *(round(4.0 * move.share) for move in told))
+        return before != self._told
 
     def as_data(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -91,11 +100,8 @@ class MountView:
         known = mount.tcp_off_m is not None
         rows += [(summary(mount), "bold green" if mount.placed else "bold yellow" if known else "red"), ("", "")]
         rows += [(bar(move), _STYLE[mount.placed or move.done]) for move in moves(mount)]
-        rows += [("", ""), (f"( ) alert limit. {DIRECTIONS}.", "dim")]
-        if (self.reply.reference_id, self.reply.revision) != (mount.reference_id, mount.revision):
-            robot, camera = self._name
-            undo = f"gripmon send undo {mount.reference_id} --robot {robot} --camera {camera}"
-            rows.append((f"{self.reply.reference_id}, which the monitor made, is in force: once in place, {undo}", ""))
+        rows += [("", ""), ("( ) alert limit", "dim"), (DIRECTIONS, "dim")]
+        rows.append((afterwards(self.reply, *self._name), ""))
         return [(printable(text), style) for text, style in rows]
 
 
@@ -116,4 +122,4 @@ def bar(move: Move) -> str:
 
 def plain(rows: Sequence[tuple[str, str]]) -> str:
     """The display without colours."""
-    return "\n".join(text.rstrip() for text, _ in rows)
+    return "\n".join(text.rstrip() for text, _ in rows).rstrip()

@@ -135,15 +135,14 @@ def _mount(arguments: Arguments, joined: dict[str, Any]) -> None:
         name = only_monitor(joined, arguments.robot, arguments.camera)
         opened = TransformClient(*name, **joined)
     with opened as client:
-        view, said = MountView(client, name), [""]
+        view = MountView(client, name)
 
         def tell() -> None:
-            line = view.look().line()
+            view.look()
             if arguments.json:
                 _print_line(view.as_data())
-            elif line != said[0]:
-                said[0] = line
-                print(f"{fleet_table.clock(time.time_ns())}  {line}", flush=True)
+            elif view.changed():
+                print(f"{fleet_table.clock(time.time_ns())}  {view.line()}", flush=True)
 
         if arguments.once:
             end_s = time.monotonic() + (arguments.seconds or 3.0)

@@ -192,7 +192,8 @@ class FleetSite:
             raise BadRequest("its newest frame has no image")
         record, wanted = snapshot.record, snapshot.reference_px if mount else None
         jpeg = overlay(np.asarray(image), record, snapshot.outlines_px, PICTURE_PX, wanted)
-        return Picture(jpeg, record.stamp_ns, record.verdict.value, view_of(reply.mount) if mount else None)
+        view = view_of(reply, *name) if mount else None
+        return Picture(jpeg, record.stamp_ns, record.verdict.value, view)
 
     def _known(self, name: MonitorName, monitor_id: str) -> MonitorStatus:
         """The status of a known monitor; names invented by a request are refused."""

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from gripmon.model.geometry import from_record, invert, log_rotation, rotation_angle, to_vector
-from gripmon.model.mount import DIRECTIONS, moves, summary
-from gripmon.model.records import Array, FrameRecord, Mount, ReferenceRecord, Verdict
+from gripmon.model.mount import DIRECTIONS, afterwards, moves, summary
+from gripmon.model.records import Array, CommandReply, FrameRecord, Mount, ReferenceRecord, Verdict
 
 _MONITOR = "monitor"
 
@@ -31,7 +31,7 @@ class MountRow(msgspec.Struct, frozen=True):
 
 class MountView(msgspec.Struct, frozen=True):
     """For a page: ``reference`` to stand at, a line of ``summary``, whether the camera is ``placed`` and whether it is
-    ``known`` where it stands, and the six bars.
+    ``known`` where it stands, the six bars, and what remains to be done ``afterwards``.
     """
 
     reference: str
@@ -40,15 +40,17 @@ class MountView(msgspec.Struct, frozen=True):
     known: bool
     directions: str
     rows: tuple[MountRow, ...]
+    afterwards: str
 
 
-def view_of(mount: Mount | None) -> MountView | None:
+def view_of(reply: CommandReply | None, robot: str, camera: str) -> MountView | None:
     """The same for a page; None from a monitor that doesn't say how its camera is mounted."""
-    if mount is None:
+    if reply is None or (mount := reply.mount) is None:
         return None
     rows = tuple(MountRow(*move) for move in moves(mount))
     target = f"{mount.reference_id} (revision {mount.revision})"
-    return MountView(target, summary(mount), mount.placed, mount.shift_m is not None, DIRECTIONS, rows)
+    known, after = mount.shift_m is not None, afterwards(reply, robot, camera)
+    return MountView(target, summary(mount), mount.placed, known, DIRECTIONS, rows, after)
 
 
 def to_stand_at(references: Sequence[ReferenceRecord]) -> ReferenceRecord:

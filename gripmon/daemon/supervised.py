@@ -54,6 +54,7 @@ _T = TypeVar("_T")
 _COMMAND_PAUSE_RATIO = 3.0
 """The next command waits this many times the duration of the last: commands take at most a quarter of the time."""
 
+_QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
@@ -206,7 +207,9 @@ class Loop(ABC):
         except Exception as error:  # noqa: BLE001  reported, also to the sender
             result = f"internal error: {in_short(error)}"
             _log.debug("command %s", command.name, exc_info=error)
-        _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, result)
+        # Pages and watch --mount ask several times a second, and a question changes nothing.
+        level = logging.DEBUG if answer is not None and command.name in _QUESTIONS else logging.INFO
+        _log.log(level, "command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, result)
         text = result if answer is None else answer.text
         carried_out = answer is not None and answer.done
         recorded = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)

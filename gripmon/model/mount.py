@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from gripmon.model.records import Mount
+from gripmon.model.records import CommandReply, Mount
 
 DIRECTIONS = (
     "right, left, up, down as in the camera's picture; forward: where it looks; clockwise: seen from behind the camera"
@@ -51,6 +51,15 @@ def _move(ends: tuple[str, str], value: float, limit: float, unit: str, shown: f
     what, _, one = ends[value > 0.0].partition(" ")
     text = f"{what} {one} {amount}" if abs(value) >= shown else f"{what} {' or '.join(e.split()[1] for e in ends)} 0"
     return Move(text, ends, value / limit, abs(value) <= limit)
+
+
+def afterwards(reply: CommandReply, robot: str, camera: str) -> str:
+    """What remains to be done once the camera is in place; empty if the reference to stand at is in force."""
+    mount = reply.mount
+    if mount is None or (reply.reference_id, reply.revision) == (mount.reference_id, mount.revision):
+        return ""
+    undo = f"gripmon send undo {mount.reference_id} --robot {robot} --camera {camera}"
+    return f"{reply.reference_id}, which the monitor made, is in force: once in place, {undo}"
 
 
 def summary(mount: Mount) -> str:

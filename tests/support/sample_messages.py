@@ -30,6 +30,7 @@ from gripmon.model.records import (
     FrameRecord,
     JawReading,
     MonitorState,
+    Mount,
     OpenAlert,
     Origin,
     Protection,
@@ -171,6 +172,10 @@ UNDONE = ReferenceRecord(
     "undo-4-77aa01c2", 4, STAMP_NS, "undo", POSE, covariance(0.002, 0.01),
     parent="recalibration-3-1f0c9a2b", restores="config-5f2ac301", accepted_by="operator",
 )  # fmt: skip
+MOUNT = Mount(
+    "config-5f2ac301", 0, 0.001, 0.035, "", (-0.0015, 0.0002, -0.0001), (0.002, -0.0035, 0.0), (0.0075, 0.0075, 0.035),
+    0.00151, 0.00403,
+)  # fmt: skip
 MONITOR = MonitorState(
     references=(CONFIGURED, RECALIBRATED),
     proposal=msgspec.structs.replace(RECALIBRATED, reference_id="recalibration-4-9be01d77", revision=4),
@@ -255,6 +260,7 @@ SAMPLES: dict[str, msgspec.Struct] = {
         "recalibration-3-1f0c9a2b",
         3,
         MONITOR,
+        mount=MOUNT,
     ),
     "reply_snapshot": CommandReply(
         CommandName.SNAPSHOT,
@@ -269,7 +275,9 @@ SAMPLES: dict[str, msgspec.Struct] = {
             0.034,
             SnapshotImage("png", 768, 576, "mono8", 301234),
             (((401.25, 310.5), (398.0, 402.75)),),
+            (((399.0, 311.25), (395.75, 403.5)),),
         ),
+        mount=MOUNT,
     ),
     "error": CommandError(
         CommandFault.TIMEOUT, "the monitor has not answered within 2 s; it may still be carried out, ask for the state"

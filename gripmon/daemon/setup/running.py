@@ -23,13 +23,12 @@ from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
 from gripmon.model.geometry import from_record
 from gripmon.model.images import read_image
-from gripmon.model.records import FrameRecord, Mount
+from gripmon.model.records import FrameRecord
 from gripmon.teach.messages import BadRequest
 
 _LINES = 200
 _ASK_EVERY_S, _ANSWER_S, _ENDS_S = 0.2, 2.0, 20.0
 _STAMP = re.compile(r"^\d{4}-\d\d-\d\d \S+ ")
-_OWN_QUESTIONS = "command snapshot: done"
 _PICTURE_PX = 1000
 _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor has this name", 130: "stopped"}
 
@@ -61,7 +60,7 @@ class MonitorProcess:
         self._threads: list[threading.Thread] = []
         self._lines: deque[str] = deque(maxlen=_LINES)
         self._record: FrameRecord | None = None
-        self._mount: Mount | None = None
+        self._mount: MountView | None = None
         self._picture: bytes | None = None
         self._shown = 0
 
@@ -113,7 +112,7 @@ class MonitorProcess:
             reason=None if record is None else record.reason,
             frame=None if record is None else record.seq,
             bound=None if bound is None else f"{1e3 * bound.position_m:.2f} mm",
-            mount=view_of(self._mount),
+            mount=self._mount,
             shown=self._shown,
             lines=tuple(self._lines),
         )
@@ -127,8 +126,7 @@ class MonitorProcess:
     def _listen(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None
         for line in process.stderr:
-            if _OWN_QUESTIONS not in line:
-                self._lines.append(_STAMP.sub("", line.rstrip()))
+            self._lines.append(_STAMP.sub("", line.rstrip()))
 
     def _ask(self, process: subprocess.Popen[str], config: Config) -> None:
         settings = config.settings
@@ -146,7 +144,8 @@ class MonitorProcess:
                     reply, data = None, None  # it is starting or ending
                 if reply is not None and reply.snapshot is not None:
                     seen = reply.snapshot
-                    self._record, self._mount = seen.record, reply.mount
+                    self._record = seen.record
+                    self._mount = view_of(reply, settings.robot, settings.camera_name)
                     moved = reply.mount is not None and not reply.mount.within
                     wanted = seen.reference_px if moved else None
                     image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

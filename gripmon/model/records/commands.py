@@ -183,7 +183,7 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
     monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""
     mount: Annotated[
         Mount | None,
-        Meta(description="answers state and snapshot: how the camera stands to the reference; null of a second camera"),
+        Meta(description="answers state and snapshot: how the camera stands to a reference; null from before it did"),
     ] = None
 
 

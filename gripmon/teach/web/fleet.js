@@ -143,6 +143,7 @@ function show(entry) {
   const proposal = $(".proposal", root);
   proposal.hidden = !card.proposal_id;
   setText($("p", proposal), `A new reference waits: ${card.proposal_id}`);
+  if (gone || ended) $(".mount", root).hidden = true;   // what it showed may no longer hold
   $(".asked", root).hidden = !entry.asked;
   $('[data-order="undo"]', root).hidden = card.revision < 1;
   const dead = gone || ended || entry.busy;

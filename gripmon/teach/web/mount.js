@@ -19,12 +19,15 @@ const setText = (node, text) => { if (node.textContent !== text) node.textConten
 
 export function showMount(root, mount) {
   if (!root.children.length) {
-    root.append(element("p", "target"), element("p", "first"), element("div", "moves"), element("p", "directions"));
+    root.append(element("p", "target"), element("p", "first"), element("p", "off"), element("div", "moves"));
+    root.append(element("p", "directions"), element("p", "afterwards"));
   }
-  const [target, first, moves, directions] = root.children;
+  const [target, first, off, moves, directions, afterwards] = root.children, [head, ...rest] = mount.summary.split(": ");
   root.dataset.kind = mount.placed ? "good" : mount.known ? "warn" : "bad";
   setText(target, `To stand as at ${mount.reference}; white: where the gripper will be seen`);
-  setText(first, mount.summary);
+  setText(first, head);
+  setText(off, rest.join(": "));
+  setText(afterwards, mount.afterwards);
   setText(directions, mount.known ? `Shaded: alert limit. ${mount.directions}.` : "");
   while (moves.children.length > mount.rows.length) moves.lastChild.remove();
   while (moves.children.length < mount.rows.length) moves.append(bar());
