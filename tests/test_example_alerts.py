@@ -160,7 +160,7 @@ def test_alertmanager_alone_does_webhooks(tmp_path: Path):
         opened.callback(hook.close)
         settings = MetricsSettings(enabled=True, port=int(ours.partition(":")[2]))
         server = opened.enter_context(contextlib.closing(MetricsServer(settings, "arm1", "wrist")))
-        server.state(state)
+        server.event(state)
         for command in commands:
             opened.enter_context(ended(subprocess.Popen(command, stderr=subprocess.DEVNULL, text=True)))
         wait_until(lambda: hook.accepted, "the webhook to be called")

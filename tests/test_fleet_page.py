@@ -326,7 +326,7 @@ def hostile() -> Iterator[str]:
 
     def speak() -> None:
         while not ends.wait(0.5):
-            monitor.state(state)
+            monitor.event(state)
 
     speaker = threading.Thread(target=speak)
     speaker.start()
@@ -375,6 +375,14 @@ def test_an_operators_way(
         assert driver.title == "gripmon fleet"
 
         outlines_lie_on_measured_corners(endpoint)
+
+        visitor.click(f"{card()} .by-hand")
+        wait_for("To stand as at demo-calibration (revision 0)", lambda: f"{card()} .mount")
+        wait_for(" first", lambda: f"{card()} .mount .first")  # the camera was knocked
+        assert visitor.script("return document.querySelectorAll(arguments[0]).length", f"{card()} .move") == 6
+        looks_right_at_every_width(visitor, card)
+        visitor.click(f"{card()} .by-hand")
+        visitor.wait(lambda: not visitor.find(f"{card()} .mount").is_displayed(), "the mount to be put away")
 
         visitor.click(f"{card()} [data-order=accept]")  # asked, and someone else is faster
         wait_for("as reference of demo/wrist?", lambda: f"{card()} .asked")
