@@ -24,7 +24,7 @@ from gripmon.model.records import Command, CommandFault, CommandName, CommandRep
 def test_every_command_arrives_once_and_its_answer_comes_back(session: zenoh.Session, loop: Loop, name: CommandName):
     [(is_reply, reply)] = answers(session, f"{CMD}/{name.value}", b'{"argument": "p-1"}')
     told = {"name": name.value, "done": True, "text": "heard 'p-1'", "reference_id": "plate-2", "revision": 7}
-    told |= {"monitor": None, "snapshot": None, "durable": True, "monitor_id": ""}
+    told |= {"monitor": None, "snapshot": None, "durable": True, "monitor_id": "", "mount": None}
     assert is_reply and reply == told | {"schema": "gripmon.reply/2"}
     assert loop.heard == [Command(name, "p-1")]
 

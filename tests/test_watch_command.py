@@ -155,12 +155,12 @@ def test_one_alert_log_through_a_router_that_is_restarted(endpoints: tuple[str, 
         with watching("--alerts", "--json", "--out", str(log), "--connect", endpoint) as (_, lines):
             with router(endpoint):
                 wait_until(lambda: log.exists() and len(texts()) >= 4, "two monitors and what they said before")
-                monitors[0].alert(said_by("one", "during"))
+                monitors[0].event(said_by("one", "during"))
                 wait_until(lambda: ("one", "during") in texts(), "the alert")
             wait_until(lambda: texts().count(("one", "vanished")) == 1, "the way to be cut")
             with router(endpoint):
                 wait_until(lambda: texts().count(("two", "appeared")) == 2, "the way back")
-                monitors[1].alert(said_by("two", "after"))
+                monitors[1].event(said_by("two", "after"))
                 wait_until(lambda: ("two", "after") in texts(), "the alert")
             shown = [(t["robot"], t.get("text")) for t in map(json.loads, lines)]
         alerts = [entry for entry in texts() if entry[1] in ("before", "during", "after")]

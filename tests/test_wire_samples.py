@@ -147,7 +147,7 @@ def heard() -> Iterator[dict[str, zenoh.Sample]]:
 
             def all_there() -> bool:
                 for leaf, record in records.items():
-                    getattr(publisher, leaf)(record)
+                    (publisher.transform if leaf == "transform" else publisher.event)(record)
                 while (sample := subscriber.try_recv()) is not None:
                     samples[str(sample.key_expr).rpartition("/")[2]] = sample
                 return samples.keys() == records.keys()
