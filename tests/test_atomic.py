@@ -22,7 +22,7 @@ OTHERWISE = {
     "cli/replay.py",
     "cli/common.py",
     "record/compared.py",  # recordings: whether they can be written there; rerun writes them
-    "record/spots.py",
+    "record/laser_scene.py",
     "analyse/corrected.py",
     "daemon/simulated.py",  # folders that were empty before
     "simulate/sequence.py",

@@ -98,7 +98,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
 
     ``usable``: the policy allows it; otherwise ``why`` gives the reason in a word and ``reason`` in a line.  ``age_s``
     bounds the time since the monitor received the frame: its processing time, the largest possible delay of the message
-    (:mod:`gripmon.client.inbox`), and the time since it arrived; the transfer of the image to the monitor is not
+    (:mod:`gripmon.client.age`), and the time since it arrived; the transfer of the image to the monitor is not
     included.  It is infinite if no transform came yet, or if the delay is unknown.  ``stamp_ns``: capture time by the
     monitor's clock; ``monitor_id``: the start of the monitor that sent it.
     """

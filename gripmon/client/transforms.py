@@ -129,7 +129,9 @@ class TransformClient(Joined):
         return self._get("reference", ReferenceRecord, timeout_s)
 
     def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
-        """The running monitors of this name, sorted; all on the network for ``TransformClient("*")``."""
+        """The running monitors of this name, sorted; all on the network for ``TransformClient("*")``.  Raises
+        :class:`gripmon.client.NotCarriedOut` without a connection, as the two above.
+        """
         return alive(self.session(timeout_s), self.keys, timeout_s)
 
     def send(
