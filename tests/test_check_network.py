@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,11 +9,9 @@ import yaml
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.io.ros2.node import typestore
 from gripmon.io.wire.session import endpoint_fault
 
 TLS_FILE = '{listen: {endpoints: ["tls/127.0.0.1:7449"]}, transport: {link: {tls: {listen_certificate: "gone.pem"}}}}'
-ROS_JAW = {"source": "ros2_joint_state", "topic": "/joint_states", "opening": {"joints": ["finger"]}}
 
 
 def written(folder: Path, **sections: object) -> str:
@@ -56,31 +53,6 @@ def test_a_session_that_cannot_be_opened(
     (tmp_path / "tls.json5").write_text(TLS_FILE)
     (tmp_path / "port.json5").write_text('{connect: {endpoints: ["tcp/127.0.0.1:70000"]}}')
     assert said in refused(written(tmp_path, publish=publish), capsys)
-
-
-@pytest.mark.parametrize(
-    ("sections", "key"),
-    [
-        ({"source": {"kind": "zenoh", "topic": "/image", "format": "ros2_image"}}, "source.format"),
-        ({"jaw": ROS_JAW}, "jaw.source"),
-        ({"ros2": {"enabled": True}}, "ros2.enabled"),
-    ],
-)
-def test_packages_that_are_missing(
-    sections: dict[str, object],
-    key: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-):
-    for name in ["rosbags", *(each for each in sys.modules if each.startswith("rosbags."))]:
-        monkeypatch.setitem(sys.modules, name, None)  # as Python notes a module that can't be had
-    typestore.cache_clear()
-    jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}
-    line = refused(written(tmp_path, **sections, **jaw), capsys)
-    assert f"config.yaml: {key}: " in line
-    assert "; pip install -e '.[ros2]' in gripmon's checkout" in line
-    typestore.cache_clear()
 
 
 @pytest.mark.parametrize(

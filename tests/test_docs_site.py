@@ -83,7 +83,7 @@ def test_a_row_of_the_configuration_says_unit_default_and_bounds():
     rows = configuration.page().splitlines()
     (row,) = [row for row in rows if row.startswith("| `monitor.policy.alert_limit_rad` |")]
     assert row.startswith("| `monitor.policy.alert_limit_rad` | number | rad | `0.035` | > 0")
-    assert sum(row.startswith("| `source.kind` |") for row in rows) == 7  # one table for each kind
+    assert sum(row.startswith("| `source.kind` |") for row in rows) == 8  # one table for each kind
 
 
 def test_what_the_explanations_name_exists():
@@ -152,7 +152,7 @@ def test_files_that_pages_name_exist():
     for page in PAGES:
         named = set(re.findall(r"(?<![\w/.-])((?:configs|tools|tests|docs)/[\w./@-]*\w)(?![\w*])", page.read_text()))
         missing = {path for path in named if not (ROOT / path).exists() and "configs/zenoh/certificates" not in path}
-        assert missing - {"docs/design.md"} == set(), page.name  # that one is of rmw_zenoh
+        assert missing == set(), page.name
 
 
 def test_a_page_that_needs_the_internet_is_found():

@@ -10,10 +10,10 @@ import pytest
 from support.episode_files import NS, WRIST, Shots, write_foxglove, write_lerobot, write_mcap, write_rosbag2
 
 import gripmon
-from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, open_source, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.model.camera import BrownConradyLens
+from gripmon.model.jaw import JointOpening
 from gripmon.model.records import Frame
 
 LENS = BrownConradyLens(

@@ -29,6 +29,7 @@ FOREIGN = {
     "zenoh": {"io", "client"},
     "rerun": {"record", "analyse"},
     "rosbags": {"io"},
+    "rclpy": {"io"},
     "prometheus_client": {"io"},
 }
 HEAVY = (
@@ -41,6 +42,7 @@ HEAVY = (
     "msgspec",
     "tqdm",
     "rosbags",
+    "rclpy",
     "rich",
     "pyarrow",
     "plotly",

@@ -1,4 +1,4 @@
-"""100,000 malformed payloads through everything that reads the network: each is refused in one line, nothing else."""
+"""90,000 malformed payloads through everything that reads the network: each is refused in one line, nothing else."""
 
 from __future__ import annotations
 
@@ -13,44 +13,18 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
-from support.rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
+from support.rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws
 
 from gripmon.io.publish.commands import _name, _request
-from gripmon.io.publish.inputs import JawError, opening_of_joints, opening_of_json
-from gripmon.io.ros2.node import JointOpening, typestore
+from gripmon.io.publish.inputs import opening_of_json
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError
 from gripmon.io.wire import Keys
+from gripmon.model.jaw import JawError
 from gripmon.model.records import CommandError, CommandFault, CommandRequest
 
 MOST_GROWTH_BYTES = 48 << 20
 """Of the resident memory; one frame that is kept of each hundred would be more."""
-
-
-def ros_message(type_name: str, **fields: object) -> bytes:
-    store = typestore()
-    time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
-    header = header_type(stamp=time_type(sec=1, nanosec=2), frame_id="camera")
-    return bytes(store.serialize_cdr(store.types[type_name](header=header, **fields), type_name))
-
-
-def ros_image() -> bytes:
-    width, height = SIZE_PX
-    return ros_message(
-        "sensor_msgs/msg/Image",
-        height=height, width=width, encoding="mono8", is_bigendian=0, step=width, data=image().ravel(),
-    )  # fmt: skip
-
-
-def ros_file() -> bytes:
-    return ros_message("sensor_msgs/msg/CompressedImage", format="png", data=np.frombuffer(files()[2], np.uint8))
-
-
-def joint_state() -> bytes:
-    return ros_message(
-        "sensor_msgs/msg/JointState",
-        name=["left", "right"], position=np.array([0.015, 0.015]), velocity=np.zeros(0), effort=np.zeros(0),
-    )  # fmt: skip
 
 
 def assert_one_line(error: Exception) -> None:
@@ -107,14 +81,6 @@ def test_3000_frames_where_one_format_is_told(frame_format: str):
     assert sum(refused.values()) + taken == 3_000 and taken < 0.2 * 3_000
 
 
-@pytest.mark.parametrize(("frame_format", "good"), [("ros2_image", ros_image()), ("ros2_compressed", ros_file())])
-def test_5000_messages_of_ros_2(frame_format: str, good: bytes):
-    decoder = PayloadDecoder(frame_format, SIZE_PX)
-    refused, taken = refusals(decoder, (Rubbish(data) for data in ros(3, 5_000, good)))
-    assert sum(refused.values()) > 2_500 and refused.total() + taken == 5_000
-    assert decoder.decode(good, "", b"whatever").stamp_ns == 1_000_000_002
-
-
 def test_15000_jaw_messages():
     count = 0
     for payload in jaws(4, 16_500):
@@ -129,22 +95,6 @@ def test_15000_jaw_messages():
     assert count > 15_000
     assert opening_of_json(b'{"stamp_ns": 1, "opening_m": 0.03}') == (1, 0.03)
     assert opening_of_json(b" 0.03\n") == (0, 0.03) and opening_of_json(b"0") == (0, 0.0)
-
-
-def test_5000_joint_states():
-    decode = opening_of_joints(JointOpening(joints=("left", "right")))
-    refused = 0
-    for payload in ros(5, 5_000, joint_state()):
-        try:
-            reported = decode(payload)
-        except JawError as error:
-            assert_one_line(error)
-            refused += 1
-            continue
-        assert reported is None or np.isfinite(reported.opening_m)
-    assert refused > 2_500
-    reported = decode(joint_state())
-    assert reported is not None and reported.opening_m == 0.03
 
 
 def test_6000_commands():

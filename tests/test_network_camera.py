@@ -16,25 +16,15 @@ from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
 
 from gripmon.cli import main
-from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, type_hash
 
 FEEDER = ROOT / "tests" / "support" / "frame_feeder.py"
 FRAMES = 12
-TOPIC = "/wrist/image"
-SOURCES = {
-    "ros2_image": f"{{kind: zenoh, topic: {TOPIC}, domain_id: 7, format: ros2_image}}",
-    "ros2_compressed": f"{{kind: zenoh, topic: {TOPIC}, domain_id: 7, format: ros2_compressed}}",
-    "png": "{kind: zenoh, key: cell-7/camera}",
-}
-JOINTS = "{source: ros2_joint_state, topic: /joint_states, domain_id: 7, opening: {joints: [finger], scale: 2.0}}"
+SOURCES = {"png": "{kind: zenoh, key: cell-7/camera}"}
 Lines = list[dict[str, Any]]
 
 
 def key_of(frame_format: str) -> str:
-    """Where a driver of that format publishes; for ROS 2 written by hand from the rules of rmw_zenoh."""
-    if frame_format.startswith("ros2_"):
-        name, message = ("Image", IMAGE) if frame_format == "ros2_image" else ("CompressedImage", COMPRESSED_IMAGE)
-        return f"7/wrist/image/sensor_msgs::msg::dds_::{name}_/{type_hash(message)}"
+    """Where a driver of that format publishes."""
     return "cell-7/camera" if frame_format == "png" else f"{PREFIX}/image"
 
 
@@ -67,7 +57,6 @@ def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, Netwo
         sequence,
         f"{{listen: [{endpoint}], jaw_max_age_s: 60.0}}",
         source=SOURCES.get(frame_format, "{kind: zenoh}"),
-        jaw=JOINTS if frame_format.startswith("ros2_") else "{source: frames}",
         name=frame_format,
     )
     with network_daemon(config, tmp_path) as daemon:
@@ -82,7 +71,7 @@ def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, Netwo
     "frame_format",
     [
         "raw",
-        "ros2_image",
+        "png",
     ],
 )
 def test_lossless_frames_give_the_transforms_of_the_files(

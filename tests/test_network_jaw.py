@@ -1,43 +1,31 @@
-"""The jaw opening from the network: a message, a number, joint states of ROS 2; and what is no opening."""
+"""The jaw opening from the network: a message, a number; and what is no opening."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 import zenoh
 from support.loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.io.publish.inputs import (
-    MOST_REPORTS,
-    DecodeOpening,
-    ReportedOpening,
-    StampedOpenings,
-    ZenohJaw,
-    opening_of_joints,
-)
-from gripmon.io.ros2.names import subscription_key
-from gripmon.io.ros2.node import JOINT_STATE, JointOpening, type_hash, typestore
+from gripmon.io.jaw import MOST_REPORTS, ReportedOpening, StampedOpenings
+from gripmon.io.publish.inputs import ZenohJaw
 from gripmon.io.wire import Link, PublishSettings, link
 from gripmon.io.wire.link import Malformed
 
 KEY = "gripmon/arm/wrist/jaw"
 TRAVEL_M = (0.0, 0.06)
-NODE_KEY = "3/gripper/joint_states/sensor_msgs::msg::dds_::JointState_"
-"""Written by hand from the rules of rmw_zenoh: domain, topic, type as DDS names it."""
 
 
 class Robot:
     """A session that reports, and the jaw that hears it."""
 
-    def __init__(self, session: zenoh.Session, jaw: ZenohJaw, key: str) -> None:
+    def __init__(self, session: zenoh.Session, jaw: ZenohJaw) -> None:
         self.jaw = jaw
         # The default drops what is too large for a queue on a busy machine.
-        self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        self._publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: self._publisher.matching_status.matching, "the jaw to listen")
 
     def says(self, payload: str | bytes, expected_m: float | None) -> None:
@@ -51,14 +39,12 @@ class Robot:
 
 
 @contextmanager
-def robot(
-    key: str = KEY, own_key: str = KEY, decode: DecodeOpening | None = None, max_age_s: float = 60.0
-) -> Iterator[Robot]:
+def robot(max_age_s: float = 60.0) -> Iterator[Robot]:
     endpoint = free_endpoint()
     link = Link(PublishSettings(listen=(endpoint,), jaw_max_age_s=max_age_s))
     try:
         with plain_session(connect=endpoint) as session:
-            yield Robot(session, ZenohJaw(link, key, decode, travel_m=TRAVEL_M), own_key)
+            yield Robot(session, ZenohJaw(link, KEY, travel_m=TRAVEL_M))
     finally:
         link.close()
 
@@ -152,42 +138,6 @@ def test_between_rare_reports_the_jaw_moves_at_the_end():
     assert len(openings) == MOST_REPORTS
     openings.add(ReportedOpening(3_000_000_000, 0.04), 2.5, 1.0)
     assert len(openings) == 1
-
-
-def joint_state(**positions: float) -> bytes:
-    """In CDR, by rosbags."""
-    store = typestore()
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
-    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-    nothing = np.zeros(0)
-    values = np.array(list(positions.values()), dtype=float)
-    message = store.types[JOINT_STATE](
-        header=header, name=list(positions), position=values, velocity=nothing, effort=nothing
-    )
-    return bytes(store.serialize_cdr(message, JOINT_STATE))
-
-
-def test_joint_states_of_a_node():
-    """Two fingers that turn: opening is an offset and a scale away from the sum of their angles."""
-    key = subscription_key(3, "/gripper/joint_states", JOINT_STATE)
-    decode = opening_of_joints(JointOpening(joints=("left", "right"), scale=-0.05, offset_m=0.06))
-    with robot(key, f"{NODE_KEY}/{type_hash(JOINT_STATE)}", decode) as arm:
-        arm.says(joint_state(elbow=1.0, left=0.2, right=0.4), 0.06 - 0.05 * 0.6000000000000001)
-        arm.says(joint_state(right=0.1, left=0.1), 0.06 - 0.05 * 0.2)
-        for wrong in (
-            joint_state(left=0.1),
-            joint_state(left=0.1, right=math.nan),
-            joint_state(left=0.1, right=math.inf),
-            joint_state(left=-9.0, right=0.0),
-            joint_state(left=0.1, right=0.1)[:-3],
-            b"0.034",
-            bytes(1 << 19),
-        ):
-            arm.errs(wrong)
-        before = arm.jaw.malformed
-        arm.says(joint_state(elbow=1.0, wrist=2.0), 0.06 - 0.05 * 0.2)  # another node's: passed over
-        arm.says(joint_state(left=0.2, right=0.2), 0.06 - 0.05 * 0.4)
-        assert arm.jaw.malformed == before
 
 
 @pytest.fixture

@@ -289,23 +289,6 @@ def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], said:
         msgspec.convert({"kind": "zenoh", **settings}, SourceSettings)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (NetworkSettings(topic="/camera/image"), r"format: auto doesn't come on a ROS 2 topic; ros2_image or"),
-        (NetworkSettings(topic="/a", key="b", format="ros2_image"), "topic: has no effect beside key"),
-        (NetworkSettings(topic="camera image", format="ros2_image"), "topic: topic 'camera image'"),
-    ],
-)
-def test_a_topic_is_one_of_ros_2(settings: NetworkSettings, said: str):
-    link = Link(PublishSettings(listen=(free_endpoint(),)))
-    try:
-        with pytest.raises(SourceError, match=said):
-            NetworkCamera(settings, link, KEY, (WIDTH, HEIGHT))
-    finally:
-        link.close()
-
-
 def test_without_a_session_there_is_no_network():
     with pytest.raises(SourceError, match=r"kind: zenoh has no session here; publish.enabled: true"):
         open_source(NetworkSettings(), Path(), keys=Keys("arm", "wrist"))

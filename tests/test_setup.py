@@ -37,7 +37,15 @@ from gripmon.daemon.setup.site import CaptureOrder, StepRequest
 from gripmon.daemon.setup.steps import defaults, in_fields
 from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
 from gripmon.daemon.teaching.source import named_source
-from gripmon.io.sources import FolderSettings, FolderSource, LiveSettings, NetworkSettings, SourceError, Waiting
+from gripmon.io.sources import (
+    FolderSettings,
+    FolderSource,
+    LiveSettings,
+    NetworkSettings,
+    Ros2CameraSettings,
+    SourceError,
+    Waiting,
+)
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.images import read_image
 from gripmon.model.records import Frame, Image, Transform, Verdict
@@ -181,12 +189,13 @@ def test_sources_by_name(tmp_path: Path):
     assert named_source("zenoh:640x480") == NetworkSettings()
     assert named_source("zenoh:640x480:a/b", (640, 480)) == NetworkSettings(key="a/b")
     topic = named_source("ros2:640x480:/camera/image_raw/compressed")
-    assert topic == NetworkSettings(topic="/camera/image_raw/compressed", format="ros2_compressed")
+    assert topic == Ros2CameraSettings(image="/camera/image_raw/compressed")
     for text, words in (
         ("", "names no camera"),
         ("zenoh:640", "names no camera"),
         ("zenoh:640x480:a/*", "without"),
         ("ros2:640x480", "topic"),
+        ("ros2:640x480:camera", "image: is 'camera'"),
         ("cam.avi", "no such folder or file"),
     ):
         with pytest.raises(SourceError, match=words) as error:

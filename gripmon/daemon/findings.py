@@ -30,7 +30,7 @@ from gripmon.daemon.forecast_values import (
     ReferenceValues,
 )
 from gripmon.daemon.promised import Level, by_forecast, images_of, kept_of, over_images, picture_of
-from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
+from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Joining, Keys
 from gripmon.teach.kept import Kept
@@ -140,8 +140,10 @@ def _source_report(config: Config) -> SourceReport:
     if isinstance(source, LiveSettings):
         return SourceReport(kind, *_live_reachable(source))
     if isinstance(source, NetworkSettings):
-        key = network_key(source, Keys(config.settings.robot, config.settings.camera_name)["image"])
+        key = source.key or Keys(config.settings.robot, config.settings.camera_name)["image"]
         return SourceReport(kind, None, f"frames on {key}; only running it shows whether any arrive")
+    if isinstance(source, Ros2CameraSettings):
+        return SourceReport(kind, None, f"images on {source.image}; only running it shows whether any arrive")
     return SourceReport(kind, True, "made by this program")
 
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from gripmon.model.records import Command, CommandError, CommandReply
+
 
 class JawFeed(Protocol):
     """Provides the jaw opening at a frame's time if the frames don't contain it, e.g.
@@ -14,6 +16,20 @@ class JawFeed(Protocol):
 
     def opening_m(self, stamp_ns: int | None = None) -> float | None: ...
     def fault(self) -> str: ...
+
+
+class Asked(Protocol):
+    """A command that somebody waits for, e.g. :class:`gripmon.io.publish.commands.PendingCommand`."""
+
+    command: Command
+
+    def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None, /) -> None: ...
+
+
+class Commands(Protocol):
+    """Commands to be carried out between two frames; ``poll`` returns the next one, None if there is none."""
+
+    def poll(self) -> Asked | None: ...
 
 
 @dataclass(frozen=True)

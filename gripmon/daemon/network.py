@@ -7,16 +7,14 @@ import dataclasses
 import logging
 
 from gripmon.daemon.config import Config, ConfigError, check_network
-from gripmon.daemon.neighbours import JawFeed, Reports
+from gripmon.daemon.neighbours import Asked, Commands, JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
 from gripmon.io.publish.commands import ZenohCommands
-from gripmon.io.publish.inputs import ZenohJaw, opening_of_joints
+from gripmon.io.publish.inputs import ZenohJaw
 from gripmon.io.publish.presence import Presence, in_words
 from gripmon.io.publish.publisher import ZenohPublisher
-from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
-from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
-from gripmon.io.ros2.publisher import Ros2Publisher
-from gripmon.io.sources import NetworkCamera, NetworkSettings, Source
+from gripmon.io.ros2.output import Ros2Output
+from gripmon.io.sources import ArrivingCamera, Source
 from gripmon.io.wire import Keys, Link, PublishError
 from gripmon.model.errors import NoResultError
 from gripmon.model.outputs import Output
@@ -39,7 +37,7 @@ class Network:
     link: Link | None
     outputs: tuple[Output, ...] = ()
     jaw: JawFeed | None = None
-    commands: ZenohCommands | None = None
+    commands: Commands | None = None
     reports: Reports = dataclasses.field(default_factory=Reports)
 
     def close(self) -> None:
@@ -64,7 +62,7 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
             presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
             network = _on_link(config, link, jaw, presence)
             failed.pop_all()
-    return _with_metrics(config, network)
+    return _with_metrics(config, _with_ros2(config, network))
 
 
 def _open_link(config: Config) -> Link | None:
@@ -73,11 +71,8 @@ def _open_link(config: Config) -> Link | None:
     settings = config.settings
     if not settings.publish.enabled:
         return None
-    publish = network_of(settings.publish, settings.ros2)
-    if publish != settings.publish:
-        _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(publish.connect))
     try:
-        return Link(publish, config.directory)
+        return Link(settings.publish, config.directory)
     except PublishError as error:
         raise ConfigError(config.path, "", str(error)) from None
 
@@ -96,16 +91,41 @@ def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
 def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
     settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
-    if settings.jaw.source in ("zenoh", "ros2_joint_state"):
-        jaw = _network_jaw(config, link, publisher.keys)
+    if settings.jaw.source == "zenoh":
+        jaw = ZenohJaw(link, publisher.keys["jaw"], travel_m=(config.gripper.jaw_min_m, config.gripper.jaw_max_m))
     commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
     heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
-    ros2 = _ros2_node(config, link)
-    _show_listeners(config, link)
     reports = Reports(
         (link.fault,), lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
     )
-    return Network(link, (publisher,) if ros2 is None else (publisher, ros2), jaw, commands, reports)
+    return Network(link, (publisher,), jaw, commands, reports)
+
+
+def _with_ros2(config: Config, network: Network) -> Network:
+    """Add the monitor as a node of ROS 2, if configured."""
+    settings, reports = config.settings, network.reports
+    if not settings.ros2.enabled:
+        return network
+    node = Ros2Output(
+        settings.ros2, settings.robot, settings.camera_name,
+        commands=settings.publish.commands, others=reports.others,
+    )  # fmt: skip
+    return dataclasses.replace(
+        network,
+        outputs=(*network.outputs, node),
+        commands=node if network.commands is None else _EitherCommands(network.commands, node),
+        reports=dataclasses.replace(reports, faults=(*reports.faults, node.fault)),
+    )
+
+
+class _EitherCommands:
+    """Commands from two networks."""
+
+    def __init__(self, *heard: Commands) -> None:
+        self._heard = heard
+
+    def poll(self) -> Asked | None:
+        return next((asked for each in self._heard if (asked := each.poll()) is not None), None)
 
 
 def _with_metrics(config: Config, network: Network) -> Network:
@@ -125,47 +145,13 @@ def _with_metrics(config: Config, network: Network) -> Network:
 
 
 def with_source(reports: Reports, source: Source) -> Reports:
-    """The reports, extended by those of a camera on the network."""
-    if not isinstance(source, NetworkCamera):
+    """The reports, extended by those of a camera on a network."""
+    if not isinstance(source, ArrivingCamera):
         return reports
     malformed = reports.malformed
     return dataclasses.replace(
         reports, faults=(*reports.faults, source.fault), malformed=lambda: malformed() + source.malformed
     )
-
-
-def _ros2_node(config: Config, link: Link) -> Output | None:
-    """The monitor as a ROS 2 node, if configured."""
-    settings = config.settings
-    if not settings.ros2.enabled:
-        return None
-    return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
-
-
-def _show_listeners(config: Config, link: Link) -> None:
-    """Announce to ROS 2 the topics that are subscribed for frames and jaw opening."""
-    settings = config.settings
-    jaw, source = settings.jaw, settings.source
-    topics = []
-    if jaw.source == "ros2_joint_state" and jaw.topic is not None:
-        topics.append(HeardTopic(jaw.domain_id, jaw.topic, JOINT_STATE))
-    if isinstance(source, NetworkSettings) and source.topic is not None:
-        type_name = IMAGE if source.format == "ros2_image" else COMPRESSED_IMAGE
-        topics.append(HeardTopic(source.domain_id, source.topic, type_name))
-    if topics:
-        namespace = f"/{as_token(settings.robot)}/{as_token(settings.camera_name)}"
-        Listeners(link, NodeName("gripmon_input", namespace), topics)
-
-
-def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
-    """The jaw opening that the robot publishes, on gripmon's key or on a ROS 2 topic."""
-    jaw = config.settings.jaw
-    travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
-    if jaw.source == "zenoh":
-        return ZenohJaw(link, keys["jaw"], travel_m=travel_m)
-    assert jaw.topic is not None and jaw.opening is not None, "checked with the configuration"
-    key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
-    return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)
 
 
 @dataclasses.dataclass(frozen=True)

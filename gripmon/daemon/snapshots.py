@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.mount import at_reference, to_stand_at
-from gripmon.io.publish.commands import PendingCommand
+from gripmon.daemon.neighbours import Asked
 from gripmon.io.publish.presence import CLOSE_WITHIN_S
 from gripmon.model.errors import in_short
 from gripmon.model.geometry import from_record
@@ -63,7 +63,7 @@ class Newest(NamedTuple):
 
 
 class _Job(NamedTuple):
-    asked: PendingCommand
+    asked: Asked
     reply: CommandReply
     newest: Newest
     asked_s: float
@@ -77,7 +77,7 @@ class Snapshots:
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
 
-    def answer(self, asked: PendingCommand, reply: CommandReply, newest: Newest | None) -> None:
+    def answer(self, asked: Asked, reply: CommandReply, newest: Newest | None) -> None:
         """Send the reply with the newest frame and its record, later; refuse if there is no frame."""
         if newest is None:
             asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))

@@ -13,11 +13,10 @@ from typing import ParamSpec, Required, TypedDict, TypeVar, Unpack
 import msgspec
 
 from gripmon import __version__
-from gripmon.daemon.neighbours import Reports
+from gripmon.daemon.neighbours import Asked, Commands, Reports
 from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import DaemonSettings, Watch
-from gripmon.io.publish.commands import PendingCommand, ZenohCommands
 from gripmon.io.publish.presence import in_words
 from gripmon.io.sources import Source, Waiting
 from gripmon.model.coverage import too_few
@@ -68,7 +67,7 @@ class Parts(TypedDict, total=False):
     stop: StopRequest | None
     robot: Required[str]
     camera: Required[str]
-    commands: ZenohCommands | None
+    commands: Commands | None
     snapshots: Snapshots | None
     reports: Reports | None
     notices: Sequence[Alert]
@@ -198,7 +197,7 @@ class Loop(ABC):
         now_s = time.monotonic()
         self._next_command_s = now_s + _COMMAND_PAUSE_RATIO * (now_s - begun_s)
 
-    def _carry_out_and_answer(self, asked: PendingCommand) -> None:
+    def _carry_out_and_answer(self, asked: Asked) -> None:
         command, answer = asked.command, None
         stamp_ns = time.time_ns()
         try:

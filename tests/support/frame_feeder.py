@@ -2,7 +2,7 @@
 
 With a part of the frames their stamps are the time of sending.
 
-It knows plain Zenoh, JSON and the libraries that make images and ROS 2 messages, nothing of gripmon.  After each frame
+It knows plain Zenoh, JSON and the libraries that make images, nothing of gripmon.  After each frame
 it waits for the transform of that frame, so that none is dropped however slow the machine is.
 """
 
@@ -23,8 +23,6 @@ import numpy as np
 import zenoh
 
 from support.loopback import WAIT_S, plain_session, wait_until
-
-JOINTS_KEY = "7/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_of_another_distribution"
 
 Sent = tuple[bytes, zenoh.Encoding | None, bytes | None]
 """Payload, encoding and attachment."""
@@ -56,40 +54,8 @@ def jpeg(image: np.ndarray, row: dict[str, str]) -> Sent:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes(), None, _note(row)
 
 
-def ros2_image(image: np.ndarray, row: dict[str, str]) -> Sent:
-    height, width = image.shape
-    message = _ros("Image", row, height=height, width=width, encoding="mono8", is_bigendian=0, step=width)
-    return message(data=image.ravel()), None, bytes(33)
-
-
-def ros2_compressed(image: np.ndarray, row: dict[str, str]) -> Sent:
-    message = _ros("CompressedImage", row, format="mono8; png compressed mono8")
-    return message(data=np.frombuffer(cv2.imencode(".png", image)[1].tobytes(), np.uint8)), None, bytes(33)
-
-
-def joint_state(row: dict[str, str]) -> bytes:
-    """A finger joint whose position is half of the opening."""
-    nothing = np.zeros(0)
-    message = _ros("JointState", row, name=["elbow", "finger"], velocity=nothing, effort=nothing)
-    return message(position=np.array([1.0, 0.5 * float(row["jaw_opening_m"])]))
-
-
-def _ros(type_name: str, row: dict[str, str], **fields: Any) -> Callable[..., bytes]:
-    """The message in CDR, once it has the rest of its fields."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    sec, nanosec = divmod(int(row["stamp_ns"]), 10**9)
-    time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
-    header = header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id="camera")
-    message_type = store.types[f"sensor_msgs/msg/{type_name}"]
-    return lambda **rest: bytes(
-        store.serialize_cdr(message_type(header=header, **fields, **rest), message_type.__msgtype__)
-    )
-
-
 FORMATS: dict[str, Callable[[np.ndarray, dict[str, str]], Sent]] = {
-    each.__name__: each for each in (raw, raw_padded, png, jpeg, ros2_image, ros2_compressed)
+    each.__name__: each for each in (raw, raw_padded, png, jpeg)
 }
 
 
@@ -113,9 +79,6 @@ def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str, *
                 row["stamp_ns"] = str(time.time_ns())
             image = cv2.imread(str(Path(folder) / row["file"]), cv2.IMREAD_UNCHANGED)
             payload, encoding, attachment = FORMATS[frame_format](image, row)
-            if frame_format.startswith("ros2_"):  # its images bring no opening: it comes before them
-                blocking = zenoh.CongestionControl.BLOCK
-                session.put(JOINTS_KEY, joint_state(row), attachment=bytes(33), congestion_control=blocking)
             publisher.put(payload, encoding=encoding, attachment=attachment)
             # Under load a transform may be dropped on its way here: whoever called compares what the monitor wrote.
             with contextlib.suppress(queue.Empty):

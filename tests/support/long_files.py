@@ -60,7 +60,7 @@ LONGEST = (
     "test_onboarding",
     "test_api",
     "test_repeats",
-    "test_ros2_processes",
+    "test_ros2",
     "test_client_processes",
     "test_parquet_example",
     "test_bench_real",

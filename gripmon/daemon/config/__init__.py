@@ -29,8 +29,7 @@ from gripmon.daemon.config.earlier import without_gone
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
-from gripmon.io.ros2.names import fault_of as ros2_fault
-from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
+from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
@@ -101,7 +100,7 @@ class Config:
         if settings.state.file != AUTO:
             return None if settings.state.file is None else self.directory / settings.state.file
         # A replay or simulation begins again each time, and so does its camera's motion.
-        live = isinstance(settings.source, LiveSettings | NetworkSettings)
+        live = isinstance(settings.source, LiveSettings | NetworkSettings | Ros2CameraSettings)
         return default_path(settings.robot, settings.camera_name) if live else None
 
     @property
@@ -194,7 +193,7 @@ def check_network(config: Config) -> Joining | None:
     :class:`ConfigError`.
     """
     try:
-        return joined(config.settings, config.camera, config.directory)
+        return joined(config.settings, config.directory)
     except SettingsError as error:
         raise ConfigError.of(config.path, error.fault) from None
 
@@ -259,8 +258,8 @@ def _with_taught(config: Config) -> Config:
 
 
 def _ros2_fault(settings: Settings) -> Fault | None:
-    fault = ros2_fault(settings.ros2, settings.publish, settings.robot, settings.camera_name)
-    return None if fault is None else Fault(f"ros2.{fault.key}", fault.wrong, fault.right)
+    fault = settings.ros2.fault(settings.robot, settings.camera_name)
+    return None if fault is None else Fault(*fault)
 
 
 def load_scenario(path: Path) -> Scenario:

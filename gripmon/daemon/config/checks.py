@@ -16,20 +16,18 @@ from numpy.typing import NDArray
 from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
-from gripmon.io.ros2.names import RosNameError, network_of, subscription_key
-from gripmon.io.ros2.node import JOINT_STATE, Ros2Missing, typestore
+from gripmon.io.ros2.node import Ros2Missing, check_rclpy, domain_of
 from gripmon.io.sources import (
     EpisodeSettings,
     FolderSettings,
     LiveSettings,
     NetworkSettings,
+    Ros2CameraSettings,
     SourceError,
     SourceSettings,
     VideoSettings,
-    network_key,
 )
 from gripmon.io.sources.live import backend_number
-from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw, to_record
@@ -251,9 +249,6 @@ def order_fault(settings: Settings) -> Fault | None:
     return None
 
 
-_NETWORK_JAWS = ("zenoh", "ros2_joint_state")
-
-
 def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
     """What is wrong with the section ``jaw``, by itself and together with other sections."""
     jaw = settings.jaw
@@ -261,22 +256,21 @@ def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
         return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
     if jaw.source == "frames" and (kind := _without_jaw(settings.source)) is not None:
         return Fault("jaw.source", f"is frames, but {kind} brings no jaw opening", "fixed or zenoh")
-    if jaw.source in _NETWORK_JAWS and not settings.publish.enabled:
+    if jaw.source == "zenoh" and not settings.publish.enabled:
         right = "publish.enabled: true, or jaw.source: fixed"
-        return Fault("jaw.source", f"is {jaw.source}, but publish.enabled is false", right)
-    return _opening_fault(jaw, gripper) or _joint_fault(jaw)
+        return Fault("jaw.source", "is zenoh, but publish.enabled is false", right)
+    if jaw.source != "frames" and isinstance(settings.source, Ros2CameraSettings) and settings.source.joint_states:
+        return Fault("source.joint_states", f"has no effect with jaw.source {jaw.source}", "jaw.source: frames")
+    return _opening_fault(jaw, gripper)
 
 
 def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | None:
     """Why images from the network can't be received."""
-    if not isinstance(source, NetworkSettings):
-        return None
-    if not publish.enabled:
+    if isinstance(source, Ros2CameraSettings):
+        fault = source.fault()
+        return None if fault is None else Fault(*fault)
+    if isinstance(source, NetworkSettings) and not publish.enabled:
         return Fault("source.kind", "is zenoh, but publish.enabled is false", "publish.enabled: true")
-    try:
-        network_key(source, "")
-    except SourceError as error:
-        return _split(f"source.{error}")
     return None
 
 
@@ -307,8 +301,8 @@ def _without_jaw(source: SourceSettings) -> str | None:
         return "a video"
     if isinstance(source, EpisodeSettings) and source.opening is None:
         return "a source without opening (joints, scale, offset_m)"
-    if isinstance(source, NetworkSettings) and source.format.startswith("ros2_"):
-        return "an image of ROS 2"
+    if isinstance(source, Ros2CameraSettings) and source.joint_states is None:
+        return "a source without joint_states and opening"
     return None
 
 
@@ -326,49 +320,33 @@ def _opening_fault(jaw: JawSettings, gripper: Gripper) -> Fault | None:
     return None
 
 
-def _joint_fault(jaw: JawSettings) -> Fault | None:
-    """``topic`` and ``opening`` are for joint states, which need both."""
-    needed = jaw.source == "ros2_joint_state"
-    for key, value, right in (
-        ("topic", jaw.topic, "the full name of a topic, /joint_states"),
-        ("opening", jaw.opening, "a section: joints (their names), scale, offset_m"),
-    ):
-        if needed and value is None:
-            return Fault(f"jaw.{key}", "is missing", right)
-        if not needed and value is not None:
-            wrong = f"has no effect with jaw.source {jaw.source}"
-            return Fault(f"jaw.{key}", wrong, f"jaw.source: ros2_joint_state, or no {key}")
-    if jaw.topic is None:
-        return None
-    try:
-        subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
-    except RosNameError as error:
-        wrong, _, right = str(error).partition("; ")
-        return Fault("jaw.topic", wrong, right)
-    return None
-
-
-def joined(settings: Settings, camera: Camera, directory: Path) -> Joining | None:
+def joined(settings: Settings, directory: Path) -> Joining | None:
     """How the network would be joined; None if it won't be.  :class:`SettingsError` if it can't be."""
     if (missing := package_fault(settings.metrics)) is not None:
         raise SettingsError(Fault(*missing))
-    if not settings.publish.enabled:
-        return None
-    source, key = settings.source, ""
+    if (fault := _ros2_missing(settings)) is not None:
+        raise SettingsError(fault)
     try:
-        found = joining(network_of(settings.publish, settings.ros2), directory)
-        if settings.jaw.source == "ros2_joint_state":
-            key = "jaw.source: "
-        elif settings.ros2.enabled:
-            key = "ros2.enabled: "
-        if key:
-            typestore()
-        if isinstance(source, NetworkSettings):
-            key = "source."
-            PayloadDecoder(source.format, (camera.width_px, camera.height_px))
-    except (PublishError, Ros2Missing, SourceError) as error:
-        raise SettingsError(_split(f"{key}{error}")) from None
-    return found
+        return joining(settings.publish, directory) if settings.publish.enabled else None
+    except PublishError as error:
+        raise SettingsError(_split(str(error))) from None
+
+
+def _ros2_missing(settings: Settings) -> Fault | None:
+    """Why ROS 2 can't be joined as these settings want; None if it can, or none of them does."""
+    domains: dict[str, int | None] = {}
+    if isinstance(settings.source, Ros2CameraSettings):
+        domains["source.kind"] = settings.source.domain_id
+    if settings.ros2.enabled:
+        domains["ros2.enabled"] = settings.ros2.domain_id
+    for key, domain_id in domains.items():
+        try:
+            check_rclpy()
+            domain_of(domain_id)
+        except Ros2Missing as error:
+            wrong, _, right = str(error).partition("; ")
+            return Fault(key, wrong, right)
+    return None
 
 
 def _split(text: str) -> Fault:

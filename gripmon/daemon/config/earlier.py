@@ -26,6 +26,27 @@ class _Gone(NamedTuple):
 
 _GONE = (
     _Gone(
+        ("source",),
+        "topic",
+        "is gone: ROS 2 is spoken by rclpy now",
+        lambda _: True,
+        "source: {kind: ros2, image: /the/topic}, in docs/howto/ros2.md",
+    ),
+    _Gone(
+        ("jaw",),
+        "topic",
+        "is gone with jaw.source ros2_joint_state",
+        lambda _: True,
+        "joint_states and opening in a source of kind ros2, with jaw: {source: frames}, in docs/howto/ros2.md",
+    ),
+    _Gone(
+        ("ros2",),
+        "router",
+        "rclpy finds ROS 2's nodes without it; remove the key, and for gripmon's own messages through that router "
+        "write publish: {mode: client, connect: [tcp/127.0.0.1:7447]}",
+        lambda router: router is not None,
+    ),
+    _Gone(
         ("monitor",),
         "look",
         "the look as a measurement is gone, and transforms come from the edges alone; remove the section",

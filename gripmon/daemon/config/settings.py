@@ -9,8 +9,7 @@ from msgspec import Meta
 
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
-from gripmon.io.ros2.names import Ros2Settings
-from gripmon.io.ros2.node import JointOpening
+from gripmon.io.ros2.settings import Ros2Settings
 from gripmon.io.sources import SourceSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.judge.statefile import StateSettings
@@ -91,10 +90,10 @@ class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Where the jaw opening of a frame comes from."""
 
     source: Annotated[
-        Literal["fixed", "frames", "zenoh", "ros2_joint_state"],
+        Literal["fixed", "frames", "zenoh"],
         Meta(
-            description="fixed: opening_m; frames: comes with each frame (simulator, timestamps.csv, network); "
-            "zenoh: key …/jaw; ros2_joint_state: topic and joints"
+            description="fixed: opening_m; frames: comes with each frame (simulator, timestamps.csv, network, "
+            "source.joint_states); zenoh: key …/jaw"
         ),
     ] = "fixed"
     opening_m: (
@@ -104,11 +103,6 @@ class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         ]
         | None
     ) = None
-    topic: (
-        Annotated[str, Meta(min_length=1, description="full name of a ROS 2 topic with sensor_msgs/JointState")] | None
-    ) = None
-    domain_id: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID of the topic (no unit)")] = 0
-    opening: JointOpening | None = None
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import msgspec
 
+from gripmon.daemon.config.typed import to_settings
 from gripmon.io.sources import (
     LiveSettings,
     NetworkCamera,
     NetworkSettings,
     OpenedSource,
+    Ros2CameraSettings,
     SourceError,
     SourceSettings,
     VideoSettings,
-    network_key,
     open_source,
     settings_for_text,
 )
@@ -58,14 +59,10 @@ def named_source(text: str, size_px: tuple[int, int] | None = None) -> SourceSet
     return settings
 
 
-def _on_network(kind: str, name: str | None) -> NetworkSettings:
+def _on_network(kind: str, name: str | None) -> NetworkSettings | Ros2CameraSettings:
     if kind == "zenoh":
         return NetworkSettings(key=None if name is None else check_key(name))
-    settings = NetworkSettings(
-        topic=name or "", format="ros2_compressed" if (name or "").endswith("/compressed") else "ros2_image"
-    )
-    network_key(settings, "")  # refuses an invalid topic name
-    return settings
+    return to_settings({"kind": "ros2", "image": name or ""}, Ros2CameraSettings)
 
 
 def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
@@ -74,14 +71,15 @@ def open_named(text: str, robot: str, camera_name: str) -> OpenedSource:
     Raises :class:`~gripmon.model.errors.InputError`.
     """
     settings = named_source(text)
+    found = _NETWORK.fullmatch(text)
+    size_px = None if found is None else (int(found[2]), int(found[3]))
     if not isinstance(settings, NetworkSettings):
         try:
-            return OpenedSource(open_source(settings))
+            return OpenedSource(open_source(settings, size_px=size_px))
         except SourceError as error:  # the error names a configuration key
             raise SourceError(f"{str(error).removeprefix('path: ').partition(';')[0]}; {_RIGHT}") from None
-    found = _NETWORK.fullmatch(text)
-    assert found is not None, "named_source has seen that it is of this form"
-    return _Networked(settings, (int(found[2]), int(found[3])), Keys(robot, camera_name))
+    assert size_px is not None, "named_source has seen that it is of this form"
+    return _Networked(settings, size_px, Keys(robot, camera_name))
 
 
 class _Networked(OpenedSource):

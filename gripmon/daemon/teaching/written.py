@@ -31,7 +31,7 @@ from gripmon.teach.session import Evaluation
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
-_JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or ros2_joint_state"
+_JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or frames"
 _DEFAULT_SECTIONS = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
 
 

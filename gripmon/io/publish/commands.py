@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 TIMEOUT_S = 2.0
 """Time that the loop has for a command, s; after it the sender gets an error reply."""
 
-_WAITING_MOST = 16
+WAITING_MOST = 16
 _REMEMBERED_MOST = 256
 _QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
 """Commands that change nothing and have large answers: repeated requests are executed again, not cached."""
@@ -178,12 +178,12 @@ class ZenohCommands:
             if known is not None and known.command != command:
                 text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
                 return CommandError(CommandFault.ID_REUSED, text)
-            if known is not None and known.askers >= _WAITING_MOST:  # each occupies a thread until its timeout
-                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} wait for this answer already; try again later")
+            if known is not None and known.askers >= WAITING_MOST:  # each occupies a thread until its timeout
+                return CommandError(CommandFault.BUSY, f"{WAITING_MOST} wait for this answer already; try again later")
             if known is not None and known.join(query, key):
                 return None
-            if len(self._waiting) >= _WAITING_MOST:
-                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
+            if len(self._waiting) >= WAITING_MOST:
+                return CommandError(CommandFault.BUSY, f"{WAITING_MOST} commands wait already; try again later")
             pending = PendingCommand(command, self._timeout_s, self._answers, self._monitor_id)
             pending.join(query, key)
             self._remember(request.id, pending)

@@ -1,5 +1,4 @@
-"""ROS 2 without a bridge: what a node on ``rmw_zenoh`` would put on the network, and reading what such nodes put there.
+"""ROS 2 by ``rclpy``: the robot's own, whatever its middleware, or the wheels of ``gripmon[ros2]``.
 
-The message definitions, their hashes and CDR come from ``rosbags``, an optional dependency (``gripmon[ros2]``) that is
-imported at the first message.
+It is imported late, and runs in threads of this process.
 """

@@ -1,5 +1,5 @@
 """Sources of frames: a folder of images, a video file, an episode of recorded messages or of a LeRobot dataset, a live
-camera, one on the network, a simulated one.
+camera, one on the network or of ROS 2, a simulated one.
 
 All are a :class:`Source`; :func:`open_source` makes one from its settings, and only then imports heavy packages.
 """
@@ -15,15 +15,25 @@ from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Sou
 from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
 from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
 from gripmon.io.sources.live import LiveCamera, LiveSettings, NewestFrame
-from gripmon.io.sources.network import NetworkCamera, NetworkSettings, network_key
+from gripmon.io.sources.network import ArrivingCamera, NetworkCamera, NetworkSettings
+from gripmon.io.sources.ros2 import Ros2Camera, Ros2CameraSettings
 from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link
 
 EpisodeSettings = BagSettings | LeRobotSettings
-SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | EpisodeSettings | LiveSettings | NetworkSettings
+SourceSettings = (
+    SimulatedSettings
+    | FolderSettings
+    | VideoSettings
+    | EpisodeSettings
+    | LiveSettings
+    | NetworkSettings
+    | Ros2CameraSettings
+)
 
 __all__ = [
     "READ_TIMEOUT_S",
+    "ArrivingCamera",
     "BagSettings",
     "BagSource",
     "EpisodeSettings",
@@ -38,6 +48,8 @@ __all__ = [
     "NetworkSettings",
     "NewestFrame",
     "OpenedSource",
+    "Ros2Camera",
+    "Ros2CameraSettings",
     "SimulatedScene",
     "SimulatedSettings",
     "Source",
@@ -47,7 +59,6 @@ __all__ = [
     "VideoSource",
     "Waiting",
     "make_simulator",
-    "network_key",
     "open_source",
     "settings_for_path",
     "settings_for_text",
@@ -67,14 +78,16 @@ def open_source(
 ) -> Source:
     """Start a source; paths in its settings are relative to ``relative_to``, the folder of the configuration file.
 
-    Only the simulator needs a ``scene``; a camera on the network needs the session, the monitor's keys and the size of
-    the images: (width, height), by default that of the scene's camera.  The simulator's real-time camera starts
-    another Python process by ``multiprocessing``, so a script that opens one needs the guard
+    Only the simulator needs a ``scene``; a camera on the network needs the session, the monitor's keys and, as one of
+    ROS 2, the size of the images: (width, height), by default that of the scene's camera.  The simulator's real-time
+    camera starts another Python process by ``multiprocessing``, so a script that opens one needs the guard
     ``if __name__ == "__main__"``.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that isn't a
     video, and a device of unknown form.  A camera that is absent at present is not an error: the source waits for it.
     """
+    if size_px is None and scene is not None:
+        size_px = scene.camera.width_px, scene.camera.height_px
     match settings:
         case SimulatedSettings():
             if scene is None:
@@ -91,11 +104,15 @@ def open_source(
         case LiveSettings():
             return LiveCamera(settings)
         case NetworkSettings():
-            if size_px is None and scene is not None:
-                size_px = scene.camera.width_px, scene.camera.height_px
             if link is None or keys is None or size_px is None:
                 raise SourceError("kind: zenoh has no session here; publish.enabled: true, and gripmon run")
             return NetworkCamera(settings, link, keys["image"], size_px)
+        case Ros2CameraSettings():
+            if size_px is None:
+                raise SourceError("kind: ros2 needs the size of the images here; size_px, (width, height)")
+            if scene is None:
+                return Ros2Camera(settings, size_px)
+            return Ros2Camera(settings, size_px, scene.camera, (scene.gripper.jaw_min_m, scene.gripper.jaw_max_m))
 
 
 def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings | EpisodeSettings:

@@ -17,9 +17,8 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.formats import InterchangeError, read_ros
-from gripmon.io.ros2.node import JointOpening, Ros2Missing, typestore
 from gripmon.io.sources.base import SourceError, Stored
-from gripmon.io.sources.payload import PayloadError, raw_image
+from gripmon.io.sources.payload import PayloadError, message_image
 from gripmon.io.sources.stored import (
     VideoDecoder,
     decoded_file,
@@ -32,7 +31,8 @@ from gripmon.io.sources.stored import (
 )
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import one_line
-from gripmon.model.records import Array, Frame, FrameNote, Image
+from gripmon.model.jaw import JointOpening
+from gripmon.model.records import Array, Frame, Image
 
 _IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
 _CAMERAS = ("CameraInfo", "CameraCalibration")
@@ -107,6 +107,13 @@ class _Mcap:
                 yield record
 
 
+@functools.cache
+def typestore() -> Any:
+    """ROS 2 Jazzy's message types; those we use are the same from Iron to Lyrical.  Raises :class:`SourceError`."""
+    typesys = needed("rosbags.typesys")
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+
+
 def _kind(type_name: str) -> str:
     return type_name.replace(".", "/").rpartition("/")[2]
 
@@ -166,10 +173,7 @@ class _Rosbag2:
 
 def open_messages(path: str) -> _Mcap | _Rosbag2:
     """The messages of a file or folder.  Raises :class:`SourceError`."""
-    try:
-        typestore()
-    except Ros2Missing as error:
-        raise SourceError(f"path: {error}") from None
+    typestore()
     return _Mcap(path) if path.lower().endswith(".mcap") else _Rosbag2(path)
 
 
@@ -290,12 +294,8 @@ class BagSource(Stored):
         if kind == "CompressedVideo":
             self._decoder = self._decoder or VideoDecoder(message.format)
             return self._decoder.decode(data)
-        size = int(message.width), int(message.height)
-        note = FrameNote(width=size[0], height=size[1], encoding=message.encoding, step=int(message.step))
-        if getattr(message, "is_bigendian", 0) and message.encoding.endswith("16"):
-            data = np.frombuffer(data, ">u2").astype("<u2").tobytes()
         try:
-            return raw_image(data, note, size), None
+            return message_image(message, data, (int(message.width), int(message.height))), None
         except PayloadError as error:
             return None, str(error)
 

@@ -15,10 +15,10 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources.base import SourceError, Stored
 from gripmon.io.sources.stored import decoded_file, file_system, joined, needed, opened, there
 from gripmon.model.errors import one_line
+from gripmon.model.jaw import JointOpening
 from gripmon.model.records import Array, Frame, Image
 
 INFO = "meta/info.json"

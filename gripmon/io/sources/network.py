@@ -1,19 +1,19 @@
-"""A camera on the network: frames that its driver puts on a Zenoh key, or on a ROS 2 topic, and how late they are."""
+"""A camera on the network: the newest frame that its driver put on a Zenoh key, and how late it is."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
-from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.io.sources.base import READ_TIMEOUT_S, Waiting
 from gripmon.io.sources.payload import (
     PayloadError,
     WrongSizeError,
-    check_size,
     file_image,
     raw_image,
     read_note,
@@ -30,12 +30,17 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 FILES = {"jpeg": JPEG, "png": PNG}
-ROS_FORMATS = ("ros2_image", "ros2_compressed")
 _PADDING_BYTES = 1 << 20
 _MOST_PIXEL_BYTES = 8  # no encoding has more
 LARGEST_ATTACHMENT_BYTES = largest_bytes(FrameNote)
 
-Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
+Format = Literal["auto", "raw", "jpeg", "png"]
+
+
+SilentAfter = Annotated[
+    float,
+    msgspec.Meta(gt=0.0, le=3600.0, description="time without a frame after which the camera counts as lost (s)"),
+]
 
 
 class NetworkSettings(
@@ -53,21 +58,10 @@ class NetworkSettings(
         ]
         | None
     ) = None
-    topic: (
-        Annotated[str, msgspec.Meta(description="ROS 2 topic instead of a key, full name: /camera/image_raw")] | None
-    ) = None
-    domain_id: Annotated[int, msgspec.Meta(ge=0, le=232, description="ROS_DOMAIN_ID of the topic (no unit)")] = 0
     format: Annotated[
-        Format,
-        msgspec.Meta(
-            description="auto: raw, JPEG or PNG, recognised by content; ros2_image, ros2_compressed: "
-            "sensor_msgs/Image, CompressedImage"
-        ),
+        Format, msgspec.Meta(description="auto: raw, JPEG or PNG, recognised by content; ROS 2 has source.kind ros2")
     ] = "auto"
-    silent_after_s: Annotated[
-        float,
-        msgspec.Meta(gt=0.0, le=3600.0, description="time without a frame after which the camera counts as lost (s)"),
-    ] = 1.0
+    silent_after_s: SilentAfter = 1.0
 
 
 class Content(NamedTuple):
@@ -78,27 +72,23 @@ class Content(NamedTuple):
     jaw_opening_m: float | None
 
 
+def largest_bytes_of(size_px: tuple[int, int]) -> int:
+    """No payload of a camera with images of (width, height) is larger."""
+    return _MOST_PIXEL_BYTES * size_px[0] * size_px[1] + _PADDING_BYTES
+
+
 class PayloadDecoder:
     """Payloads of one camera -> images.  A pure function of its input: no clock, no state."""
 
     def __init__(self, frame_format: Format, size_px: tuple[int, int]) -> None:
-        """``size_px`` is (width, height) of every image.  Raises SourceError where ROS 2 isn't installed."""
+        """``size_px`` is (width, height) of every image."""
         self._format, self._size_px = frame_format, size_px
-        self.largest_bytes = _MOST_PIXEL_BYTES * size_px[0] * size_px[1] + _PADDING_BYTES
-        if frame_format in ROS_FORMATS:
-            from gripmon.io.ros2.node import Ros2Missing, typestore
-
-            try:
-                typestore()  # now, not with the first frame: it takes a while
-            except Ros2Missing as error:
-                raise SourceError(f"format: {frame_format} can't be read; {error}") from None
+        self.largest_bytes = largest_bytes_of(size_px)
 
     def decode(self, payload: bytes, encoding: str, attachment: bytes | None) -> Content:
         """``encoding`` is Zenoh's.  Raises :class:`PayloadError` for everything that is wrong."""
         if len(payload) > self.largest_bytes:
             raise PayloadError(f"{len(payload)} bytes; at most {self.largest_bytes} for an image of this camera")
-        if self._format in ROS_FORMATS:
-            return self._of_ros(payload)
         note = read_note(attachment)
         kind = self._kind(payload, encoding, note)
         if kind == "raw":
@@ -121,63 +111,55 @@ class PayloadDecoder:
             return "png"
         return "raw"
 
-    def _of_ros(self, payload: bytes) -> Content:
-        from gripmon.io.ros2 import node as ros2
 
-        try:
-            if self._format == "ros2_image":
-                stamp_ns, image = ros2.decode_image(payload)
-                check_size((image.shape[1], image.shape[0]), self._size_px)
-            else:
-                stamp_ns, _, data = ros2.decode_compressed_image(payload)
-                image = file_image(data, self._size_px)
-        except ros2.MessageError as error:
-            raise PayloadError(str(error)) from None
-        return Content(image, stamp_ns or None, None)
+class Arrival(NamedTuple):
+    """What came (``sample``, as the network gives it), and when."""
 
-
-class _Arrival(NamedTuple):
-    sample: zenoh.Sample
+    sample: Any
     unix_ns: int
     monotonic_s: float
 
 
-class NetworkCamera:
+class ArrivingCamera(ABC):
     """The newest frame that a driver published; older ones that were not read are counted as dropped.
 
-    Zenoh's thread only puts each sample into a slot for one; it is decoded in :meth:`read`, in the caller's thread, so
-    dropped frames cost nothing.  ``seq`` counts arrivals, without malformed payloads.
+    The network's thread only puts each sample into a slot for one; it is decoded in :meth:`read`, in the caller's
+    thread, so dropped frames cost nothing.  ``seq`` counts arrivals, without malformed payloads.
 
     A malformed payload is counted, logged once, and ignored as long as good ones come.  If only malformed ones come,
     ``read`` returns a frame with the fault after ``READ_TIMEOUT_S``.
 
-    ``stamp_ns`` is the driver's stamp, else Zenoh's time stamp, else the arrival here.
+    ``stamp_ns`` is the driver's stamp, else the network's, else the arrival here.
     """
 
     live = True
 
-    def __init__(self, settings: NetworkSettings, link: Link, image_key: str, size_px: tuple[int, int]) -> None:
-        """``image_key`` is where settings without key and topic listen.  Raises :class:`SourceError`."""
-        self._settings = settings
-        self.key = network_key(settings, image_key)
-        self._decoder = PayloadDecoder(settings.format, size_px)
-        self._malformed = Malformed("frame", self.key)
-        self._link = link
+    def __init__(self, key: str, silent_after_s: float) -> None:
+        """``key``: where frames come from, for messages."""
+        self.key = key
+        self._silent_after_s = silent_after_s
+        self._malformed = Malformed("frame", key)
         self._changed = threading.Condition()
-        self._slot: _Arrival | None = None
+        self._slot: Arrival | None = None
         self._closed = False
         self._dropped = self._dropped_before = self._handed_over = 0
         self._newest: tuple[float, int] | None = None  # of good payloads: monotonic time of arrival, stamp
         self._last_arrival_s: float | None = None
         self._clock_fault = ""
         self._lateness = Lateness()
-        self._subscriber: zenoh.Subscriber[None] | None = None
-        link.attach(self._attach)
+
+    @abstractmethod
+    def _content(self, arrival: Arrival) -> Content:
+        """The decoded sample.  Raises :class:`PayloadError` for everything that is wrong."""
+
+    @abstractmethod
+    def _why_silent(self) -> str:
+        """Why nothing comes, for a person."""
 
     @property
     def connected(self) -> bool:
         last_s = self._last_arrival_s
-        return not self._closed and last_s is not None and time.monotonic() - last_s < self._settings.silent_after_s
+        return not self._closed and last_s is not None and time.monotonic() - last_s < self._silent_after_s
 
     @property
     def dropped(self) -> int:
@@ -197,7 +179,7 @@ class NetworkCamera:
         fault, refusal = "", Refusal.NOT_AN_IMAGE
         while (arrival := self._take(deadline_s)) is not None:
             try:
-                content = self._content(arrival.sample)
+                content = self._content(arrival)
             except Exception as error:  # noqa: BLE001  malformed input from anyone must not end the monitor
                 if not isinstance(error, PayloadError):
                     _log.debug("a payload on %s", self.key, exc_info=error)
@@ -214,28 +196,14 @@ class NetworkCamera:
         return Waiting(self._why_silent())
 
     def close(self) -> None:
-        import zenoh
-
         with self._changed:
             self._closed = True
             self._slot = None
             self._changed.notify_all()
-        subscriber, self._subscriber = self._subscriber, None
-        if subscriber is not None:
-            try:
-                subscriber.undeclare()
-            except zenoh.ZError:
-                return  # the session was closed before
 
-    def _attach(self, session: zenoh.Session) -> None:
-        self._subscriber = session.declare_subscriber(self.key, in_zenohs_thread(self._receive))
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        import zenoh
-
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
-        arrival = _Arrival(sample, time.time_ns(), time.monotonic())
+    def _arrived(self, sample: Any) -> None:
+        """Take a sample, in the network's thread."""
+        arrival = Arrival(sample, time.time_ns(), time.monotonic())
         with self._changed:
             if self._closed:
                 return
@@ -245,7 +213,7 @@ class NetworkCamera:
             self._last_arrival_s = arrival.monotonic_s
             self._changed.notify_all()
 
-    def _take(self, deadline_s: float) -> _Arrival | None:
+    def _take(self, deadline_s: float) -> Arrival | None:
         """The next sample that has arrived, or arrives until the deadline."""
         with self._changed:
             left_s = deadline_s - time.monotonic()
@@ -256,22 +224,8 @@ class NetworkCamera:
             self._dropped_before = self._dropped
             return arrival
 
-    def _content(self, sample: zenoh.Sample) -> Content:
-        size = len(sample.payload)
-        if size > self._decoder.largest_bytes:
-            raise PayloadError(f"{size} bytes; at most {self._decoder.largest_bytes} for an image of this camera")
-        attachment = sample.attachment
-        if attachment is not None and len(attachment) > LARGEST_ATTACHMENT_BYTES:
-            raise PayloadError(f"an attachment of {len(attachment)} bytes; at most {LARGEST_ATTACHMENT_BYTES}")
-        return self._decoder.decode(
-            sample.payload.to_bytes(), str(sample.encoding), None if attachment is None else attachment.to_bytes()
-        )
-
-    def _frame(self, arrival: _Arrival, content: Content) -> Frame:
-        stamp_ns = content.stamp_ns
-        if stamp_ns is None:
-            stamped = arrival.sample.timestamp
-            stamp_ns = arrival.unix_ns if stamped is None else stamped.get_time_as_ntp64().as_nanos()
+    def _frame(self, arrival: Arrival, content: Content) -> Frame:
+        stamp_ns = arrival.unix_ns if content.stamp_ns is None else content.stamp_ns
         self._newest = arrival.monotonic_s, stamp_ns
         self._clock_fault = clock_fault(self.key, stamp_ns, arrival.unix_ns)
         arrived_ns = round(1e9 * arrival.monotonic_s)
@@ -292,6 +246,53 @@ class NetworkCamera:
             return time.time_ns()
         arrival_s, stamp_ns = self._newest
         return stamp_ns + round(1e9 * (time.monotonic() - arrival_s))
+
+
+class NetworkCamera(ArrivingCamera):
+    """A camera whose driver puts its frames on a Zenoh key."""
+
+    def __init__(self, settings: NetworkSettings, link: Link, image_key: str, size_px: tuple[int, int]) -> None:
+        """``image_key`` is where settings without a key listen."""
+        super().__init__(settings.key or image_key, settings.silent_after_s)
+        self._decoder = PayloadDecoder(settings.format, size_px)
+        self._link = link
+        self._subscriber: zenoh.Subscriber[None] | None = None
+        link.attach(self._attach)
+
+    def close(self) -> None:
+        import zenoh
+
+        super().close()
+        subscriber, self._subscriber = self._subscriber, None
+        if subscriber is not None:
+            try:
+                subscriber.undeclare()
+            except zenoh.ZError:
+                return  # the session was closed before
+
+    def _attach(self, session: zenoh.Session) -> None:
+        self._subscriber = session.declare_subscriber(self.key, in_zenohs_thread(self._receive))
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        import zenoh
+
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._arrived(sample)
+
+    def _content(self, arrival: Arrival) -> Content:
+        sample: zenoh.Sample = arrival.sample
+        size = len(sample.payload)
+        if size > self._decoder.largest_bytes:
+            raise PayloadError(f"{size} bytes; at most {self._decoder.largest_bytes} for an image of this camera")
+        attachment = sample.attachment
+        if attachment is not None and len(attachment) > LARGEST_ATTACHMENT_BYTES:
+            raise PayloadError(f"an attachment of {len(attachment)} bytes; at most {LARGEST_ATTACHMENT_BYTES}")
+        content = self._decoder.decode(
+            sample.payload.to_bytes(), str(sample.encoding), None if attachment is None else attachment.to_bytes()
+        )
+        if content.stamp_ns is None and sample.timestamp is not None:
+            return content._replace(stamp_ns=sample.timestamp.get_time_as_ntp64().as_nanos())
+        return content
 
     def _why_silent(self) -> str:
         network = self._link.fault()
@@ -316,24 +317,6 @@ def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:
                 f"stamps on {key} are {words} or more {'behind' if late_s > 0.0 else 'ahead of'} this machine's clock"
             )
     return ""
-
-
-def network_key(settings: NetworkSettings, image_key: str) -> str:
-    """The key expression to listen on.  Raises :class:`SourceError`, the key as in the settings."""
-    ros = settings.format in ROS_FORMATS
-    if settings.topic is None:
-        return image_key if settings.key is None else settings.key
-    if settings.key is not None:
-        raise SourceError("topic: has no effect beside key; one of them")
-    if not ros:
-        raise SourceError(f"format: {settings.format} doesn't come on a ROS 2 topic; {' or '.join(ROS_FORMATS)}")
-    from gripmon.io.ros2 import names, node
-
-    message = node.IMAGE if settings.format == "ros2_image" else node.COMPRESSED_IMAGE
-    try:
-        return names.subscription_key(settings.domain_id, settings.topic, message)
-    except names.RosNameError as error:
-        raise SourceError(f"topic: {error}") from None
 
 
 MOST_LATE_S = 3.0

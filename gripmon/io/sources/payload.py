@@ -7,7 +7,7 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,6 +73,15 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
         raise PayloadError(f"{len(payload)} bytes; {step * note.height} ({note.height} rows of {step})")
     rows = np.frombuffer(payload, f"<{pixels.dtype}").reshape(note.height, step // item)
     return unpacked(rows, note.width, pixels)
+
+
+def message_image(message: Any, data: bytes, expected_px: tuple[int, int]) -> Image:
+    """``sensor_msgs/Image`` (or Foxglove's) with its ``data`` -> as :func:`raw_image`, in either byte order."""
+    pixels = ENCODINGS.get(message.encoding)
+    if getattr(message, "is_bigendian", 0) and pixels is not None and len(data) % pixels.item_bytes == 0:
+        data = np.frombuffer(data, f">{pixels.dtype}").astype(f"<{pixels.dtype}").tobytes()
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    return raw_image(data, FrameNote(width=width, height=height, encoding=message.encoding, step=step), expected_px)
 
 
 def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:

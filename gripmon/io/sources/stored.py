@@ -10,10 +10,10 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.io.ros2.node import opening_between
 from gripmon.io.sources.base import SourceError
 from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG
+from gripmon.model.jaw import opening_between
 from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.records import Array, Image
 
