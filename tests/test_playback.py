@@ -113,36 +113,19 @@ def test_a_frame_without_an_image_has_no_picture(recording: Recording):
 
 
 def blobs(found: Recording) -> list[bytes | None]:
-    shots = [found.shot(seq) for seq in found.image_seqs.tolist()]
-    return [None if shot is None else shot.blob for shot in shots]
+    return [None if shot is None else shot.blob for _, shot in found.with_shots(found.image_seqs)]
 
 
-def test_a_shot_comes_with_what_was_reported(run: Run, recording: Recording):
-    for seq in recording.image_seqs.tolist():
-        shot = recording.shot(seq)
-        assert shot is not None and shot.seq == seq
-        assert shot.stamp_ns == run.records[shot.seq].stamp_ns
-        assert shot.jaw_reported_m == pytest.approx(0.02 + 1e-4 * shot.seq, abs=1e-15)
+def test_every_image_comes_again_with_its_record(run: Run, recording: Recording):
+    again = list(recording.with_shots(recording.frames.seq))
+    assert [record for record, _ in again] == list(run.records)
+    shots = {record.seq: shot for record, shot in again if shot is not None}
+    assert list(shots) == recording.image_seqs.tolist() == sorted(recording.images())
+    for seq, shot in shots.items():
+        assert shot.seq == seq and shot.stamp_ns == run.records[seq].stamp_ns
+        assert recording.jaw_reported_m(seq) == pytest.approx(0.02 + 1e-4 * seq, abs=1e-15)
         decoded = decode_image(shot.blob)
         assert decoded is not None and np.array_equal(decoded, cv2.imdecode(np.frombuffer(shot.blob, np.uint8), -1))
-
-
-def test_one_image_needs_a_small_part_of_the_files(run: Run, recording: Recording, monkeypatch: pytest.MonkeyPatch):
-    import os
-
-    read = 0
-    pread = os.pread
-
-    def counting(descriptor: int, size: int, offset: int) -> bytes:
-        nonlocal read
-        data = pread(descriptor, size, offset)
-        read += len(data)
-        return data
-
-    fresh = open_recordings(run.files).recordings[0]
-    monkeypatch.setattr(os, "pread", counting)
-    assert fresh.picture(int(fresh.image_seqs[-1])) is not None
-    assert 0 < read < 0.4 * sum(path.stat().st_size for path in run.files)
 
 
 def test_only_some_records(run: Run, recording: Recording):
@@ -184,7 +167,7 @@ def test_json_lines_are_a_recording_without_images(tmp_path: Path):
     assert found.faults == () and len(found.image_seqs) == 0
     assert [to_json(r) for r in found.records()] == lines(*records)
     assert [a.seq for a in found.alerts] == [40, 90]
-    assert found.picture(3) is None and found.shot(3) is None
+    assert found.picture(3) is None and found.images() == {}
 
 
 def test_what_rerun_merged_reads_the_same(run: Run, recording: Recording, tmp_path: Path):
@@ -210,6 +193,7 @@ def test_files_put_one_behind_the_other(run: Run, recording: Recording, tmp_path
     assert np.array_equal(found.image_seqs, recording.image_seqs)
     (fault,) = found.faults
     assert "its messages were read one by one" in fault
+    assert list(tmp_path.iterdir()) == [joined]
 
 
 def test_a_folder_stands_for_all_below_but_what_is_being_made(run: Run, tmp_path: Path):

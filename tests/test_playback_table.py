@@ -11,7 +11,7 @@ from support.playback_runs import lines, records_of_a_run, table_of
 from support.recorded import record
 
 from gripmon.model.geometry import from_record
-from gripmon.model.records import FrameRecord, Origin, State, ValidBy, Verdict, to_json
+from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
 from gripmon.record.read import open_recordings
 from gripmon.record.table import FrameTable, TableBuilder, pose_matrices
 
@@ -76,14 +76,16 @@ def test_null_is_not_a_number(records: list[FrameRecord], table: FrameTable):
         assert any(null) and np.array_equal(np.isnan(column), null), name
 
 
-def test_a_record_of_schema_1_is_absolute():
-    made = record(0)
-    old = msgspec.structs.replace(made, valid_by=ValidBy.ABSOLUTE, since_reference=None, absolute=None)
-    table = table_of([old])
+def test_a_record_of_schema_1_is_absolute(tmp_path: Path):
+    line = msgspec.json.decode(to_json(record(0))) | {"schema": "gripmon.transform/1"}
+    for later in ("valid_by", "since_reference", "absolute"):
+        line.pop(later)
+    path = tmp_path / "earlier.jsonl"
+    path.write_bytes(msgspec.json.encode(line) + b"\n")
+    (run,) = open_recordings([path]).recordings
+    table = run.frames
     assert FrameTable.VALID_BY[table.valid_by[0]] == "absolute" and (table.since[0], table.since_ns[0]) == (-1, -1)
     assert table.absolute_m[0] == table.protection_m[0] and np.array_equal(table.absolute, table.cam_T_grip)
-    unbounded = msgspec.structs.replace(old, valid_by=ValidBy.REFERENCE)
-    assert np.isnan(table_of([unbounded]).absolute_m[0]) and np.isnan(table_of([unbounded]).absolute[0]).all()
 
 
 def test_a_suspect_frame_was_measured_and_a_held_one_was_not():
@@ -91,16 +93,6 @@ def test_a_suspect_frame_was_measured_and_a_held_one_was_not():
     held = msgspec.structs.replace(suspect, source=Origin.HELD, reason="hidden")
     assert table_of([suspect, held]).refused.tolist() == [False, True]
     assert suspect.measured and not held.measured
-
-
-def test_lines_of_an_older_version_have_no_bounds(tmp_path: Path):
-    line = msgspec.json.decode(to_json(record(0)))
-    assert line.pop("protection")
-    path = tmp_path / "older.jsonl"
-    path.write_bytes(msgspec.json.encode(line) + b"\n" + to_json(record(1)) + b"\n")
-    (run,) = open_recordings([path]).recordings
-    table = run.frames
-    assert np.isnan(table.protection_m).tolist() == [True, False] and np.isnan(table.integrity_risk[0])
 
 
 def test_matrices_are_those_of_the_geometry(records: list[FrameRecord], table: FrameTable):

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-from rerun.chunk import LazyStore
-from support.recorded import frame, record, recorder
 
 from gripmon.record.container import RerunChangedError
 from gripmon.record.files import FileSeries
-from gripmon.record.read import open_recordings
 from gripmon.record.recorder import make_scene
 
 GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
@@ -22,22 +19,6 @@ def test_they_are_used_in_one_file_alone():
     private = re.compile(r"\brr\.bindings|rerun_bindings|\._chunk_index|rerun\.\w*\._|rerun\._")
     using = {path.name for path in GRIPMON.rglob("*.py") if private.search(path.read_text())}
     assert using <= {"container.py"}
-
-
-def test_without_its_chunk_index_files_are_read_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    writer = recorder(tmp_path)
-    for i in range(10):
-        writer.frame(frame(i), record(i), lambda: None)
-    writer.close(30.0)
-    (path,) = tmp_path.glob("*.rrd")
-    (whole,) = open_recordings([path]).recordings
-    assert whole.faults == ()
-    monkeypatch.delattr(LazyStore, "_chunk_index")
-    (read,) = open_recordings([path]).recordings
-    assert list(read.frames.seq) == list(whole.frames.seq) == list(range(10))
-    (fault,) = read.faults
-    assert "its messages were read one by one: rerun-sdk" in fault
-    assert fault.endswith("gripmon needs rerun-sdk>=0.41,<0.42 (pip install 'rerun-sdk>=0.41,<0.42')")
 
 
 def test_a_recorder_that_could_not_free_its_files_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -184,11 +184,8 @@ def _picture_seqs(event: Event, source: Recording, track: Track, images: NDArray
 
 def _with_overlay(source: Recording, seqs: NDArray[np.int64]) -> int:
     """The first of some frames whose picture has an overlay, which not all pictures of an alert have."""
-    for seq in seqs[:_OVERLAY_FRAMES].tolist():
-        picture = source.picture(seq)
-        if picture is not None and picture.predicted_edges:
-            return int(seq)
-    return int(seqs[0])
+    drawn = np.isin(seqs[:_OVERLAY_FRAMES], source.overlay_seqs)
+    return int(seqs[np.argmax(drawn)])
 
 
 def _summary(reports: Sequence[RecordingReport]) -> str:

@@ -62,7 +62,10 @@ def page(report: Report, analysed: Sequence[AnalysedRecording], step: Callable[[
             if each.report.integrity is not None:
                 figures[f"protection-{n}"] = as_json(protection_figure(each.report))
             figures[f"running-{n}"] = as_json(running_figure(each.report))
-        for event in _cards(each.report.events):
+        cards = _cards(each.report.events)
+        seqs = [seq for event in cards for seq in (event.before_seq, event.at_seq, event.after_seq) if seq is not None]
+        each.source.prepare(seqs)
+        for event in cards:
             shown[n, event.number] = _pictures(each, event)
         step()
     return rendered(

@@ -2,8 +2,9 @@
 
 ``<out>/<table>/robot=…/camera=…/date=YYYY-MM-DD/<run>-<number>.parquet``: each file of a recording gives one file per
 table and day (UTC), which is replaced when it is exported again.  References, which outlive a day, are not partitioned
-by date: each has its own file.  Units and descriptions are in the schemas' metadata.  Of a covariance (6 x 6,
-symmetric) the upper triangle is stored, row by row: 21 numbers, ``UPPER`` of the flat 36.
+by date: each has its own file.  Columns, units and descriptions, in the schemas' metadata, are those of the frame table
+and of the messages themselves.  Of a covariance (6 x 6, symmetric) the upper triangle is stored, row by row: 21
+numbers, ``UPPER`` of the flat 36.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any
 from urllib.parse import quote
 
 import msgspec
+import msgspec.inspect as kinds
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -30,178 +32,167 @@ from gripmon import __version__
 from gripmon.model.atomic import opened_atomically, remove_leftovers
 from gripmon.model.errors import NoResultError
 from gripmon.model.lerobot_columns import POSE_NAMES
-from gripmon.model.records import ReferenceRecord
+from gripmon.model.records import AlertRecord, RecordedCommand, ReferenceRecord, StateRecord, Transform
+from gripmon.model.records.references import ReferenceInputs
 from gripmon.record.read import open_recordings, recording_files
 from gripmon.record.recordings import Recording, file_number
-from gripmon.record.table import FrameTable
+from gripmon.record.table import COLUMNS, FrameTable
 
 UPPER = np.ravel_multi_index(np.triu_indices(6), (6, 6))
 _TRIANGLE = pa.list_(pa.float64(), len(UPPER))
 _TIME = pa.timestamp("ns", tz="UTC")
-_CAUSES = pa.list_(pa.struct([("cause", pa.string()), ("probability", pa.float64()), ("part", pa.string())]))
-
-_Column = tuple[str, pa.DataType, str, str]
-_DOUBLE, _INTEGER, _TEXT, _TRUTH = pa.float64(), pa.int64(), pa.string(), pa.bool_()
-
-_AXES = ("x", "y", "z")
+_ARROW = {np.float64: pa.float64(), np.int64: pa.int64(), np.int32: pa.int32(), np.bool_: pa.bool_()}
+_UNITS = (("_m_per_min", "m/min"), ("_per_s", "1/s"), ("_rad", "rad"), ("_px", "px"), ("_ns", "ns"), ("_m", "m"),
+          ("_s", "s"))  # fmt: skip
 
 
-def _pose_columns(name: str, what: str) -> list[_Column]:
+def _field(name: str, kind: pa.DataType, unit: str, text: str) -> pa.Field:
+    return pa.field(name, kind, metadata={"unit": unit, "description": text})
+
+
+def _pose_names(name: str) -> list[str]:
+    return [f"{name}_{part}" for part in POSE_NAMES]
+
+
+def _axis_names(name: str) -> list[str]:
+    return [f"{name.removesuffix('_m')}_{axis}_m" for axis in "xyz"]
+
+
+def _pose_fields(name: str, text: str) -> list[pa.Field]:
     units = ("m",) * 3 + ("1",) * 4
-    return [
-        (f"{name}_{part}", _DOUBLE, unit, f"{what}: position of the TCP in camera axes, unit quaternion x, y, z, w")
-        for part, unit in zip(POSE_NAMES, units, strict=True)
-    ]
+    return [_field(one, pa.float64(), unit, text) for one, unit in zip(_pose_names(name), units, strict=True)]
 
 
-def _shift_columns(what: str) -> list[_Column]:
-    return [(f"tcp_shift_{axis}_m", _DOUBLE, "m", f"{what} along the camera's {axis}") for axis in _AXES]
+def _axis_fields(name: str, text: str) -> list[pa.Field]:
+    return [_field(one, pa.float64(), "m", f"{text}, along the camera's {one[-3]}") for one in _axis_names(name)]
 
 
-_TRIANGLE_WORDS = "upper triangle, row by row, of 6 x 6: the TCP's position in camera axes, then the rotation vector"
-_WHEN: list[_Column] = [
-    ("time", _TIME, "UTC", "stamp_ns as a time"),
-    ("stamp_ns", _INTEGER, "ns", "capture time, or when it was published: Unix"),
-    ("seq", _INTEGER, "1", "number of the frame, or of the last one before it"),
-]
-_RUN: list[_Column] = [
-    ("recording_id", _TEXT, "", "the run of the monitor that this is from"),
-    ("file_number", pa.int32(), "1", "which of the recording's files it is from"),
-]
-_REFERENCE: list[_Column] = [
-    ("reference_id", _TEXT, "", "the reference in force, which drift is measured against"),
-    ("revision", _INTEGER, "1", "of the reference"),
-]
+def _triangle_field(name: str, text: str) -> pa.Field:
+    return _field(name, _TRIANGLE, "m2, m rad, rad2", f"upper triangle, row by row: {text}")
 
-_FRAMES: list[_Column] = [
-    *_WHEN,
-    ("verdict", _TEXT, "", "valid, suspect or unknown"),
-    ("state", _TEXT, "", "what the monitor was doing"),
-    ("source", _TEXT, "", "update, recalibration or held"),
-    *_shift_columns("displacement of the TCP against the reference"),
-    *[(f"sigma_{axis}_m", _DOUBLE, "m", f"standard deviation of the TCP along the camera's {axis}") for axis in _AXES],
-    ("protection_m", _DOUBLE, "m", "protection level: bound on the TCP's position error"),
-    ("protection_rad", _DOUBLE, "rad", "bound on the angle of the rotation error"),
-    ("integrity_risk", _DOUBLE, "1", "probability per frame that the error exceeds a bound"),
-    ("valid_by", _TEXT, "", "which error that is: reference, of the motion since the reference; absolute"),
-    ("since_reference_m", _DOUBLE, "m", "bound on the TCP's position error of the motion since the reference"),
-    ("since_reference_rad", _DOUBLE, "rad", "bound on the angle of its rotation error"),
-    ("since", _TEXT, "", "what that motion counts from: reference or first_proved"),
-    ("since_ns", _INTEGER, "ns", "stamp of the frames that it counts from: Unix"),
-    ("absolute_m", _DOUBLE, "m", "bound on the TCP's position error of the transform as measured"),
-    ("absolute_rad", _DOUBLE, "rad", "bound on the angle of its rotation error"),
-    *_pose_columns("absolute", "the transform as measured"),
-    ("d_m", _DOUBLE, "m", "length of the camera's displacement against the reference"),
-    ("delta_rad", _DOUBLE, "rad", "turn of the camera against the reference"),
-    *_pose_columns("cam_T_grip", "maps gripper to camera coordinates; what valid_by names"),
-    ("covariance", _TRIANGLE, "m2, m rad, rad2", f"of cam_T_grip: {_TRIANGLE_WORDS}"),
-    *_pose_columns("smoothed", "cam_T_grip averaged over time"),
-    ("smoothed_covariance", _TRIANGLE, "m2, m rad, rad2", f"of smoothed: {_TRIANGLE_WORDS}"),
-    *_REFERENCE,
-    ("rms_px", _DOUBLE, "px", "root mean square of the corners' residuals"),
-    ("jaw_opening_m", _DOUBLE, "m", "as the image shows it"),
-    ("latency_ns", _INTEGER, "ns", "from when the frame came to the monitor's machine to judged"),
-    ("corners_used", pa.int32(), "1", "corners that the transform rests on"),
-    ("corners_total", pa.int32(), "1", "corners of the gripper file"),
-    ("refused", _TRUTH, "", "nothing was measured in this frame"),
-    *_RUN,
-]
 
-_ALERTS: list[_Column] = [
-    *_WHEN,
-    ("event", _TEXT, "", "raised, updated, cleared or noted"),
-    ("alert_id", _TEXT, "", "the same from raised to cleared; empty for what is only noted"),
-    ("kind", _TEXT, "", "what it is about"),
-    ("cause", _TEXT, "", "the most probable one"),
-    ("part", _TEXT, "", "the finger that the cause is about"),
-    ("severity", _TEXT, "", "info, warning or error"),
-    ("text", _TEXT, "", "one line for a person"),
-    ("causes", _CAUSES, "1", "all that were weighed, with their probabilities"),
-    *_shift_columns("of the TCP against the reference"),
-    ("rotation_rad", _DOUBLE, "rad", "turn against the reference"),
-    ("rate_m_per_min", _DOUBLE, "m/min", "speed of a creep"),
-    ("time_left_s", _DOUBLE, "s", "until a creep reaches the limit"),
-    ("since_ns", _INTEGER, "ns", "when it was raised: Unix"),
-    ("acknowledged", _TRUTH, "", "an operator has taken note of it"),
-    ("state", _TEXT, "", "what the monitor was doing"),
-    *_REFERENCE,
-    *_RUN,
-]
-
-_STATES: list[_Column] = [
-    *_WHEN,
-    ("state", _TEXT, "", "what the monitor was doing"),
-    ("verdict", _TEXT, "", "of the last transform"),
-    ("message", _TEXT, "", "what is wrong, in words; empty when all is well"),
-    *_REFERENCE,
-    ("frames", _INTEGER, "1", "handled since the start"),
-    ("frames_refused", _INTEGER, "1", "of these, those that couldn't be measured at all"),
-    ("frames_dropped", _INTEGER, "1", "that came while another one was worked on"),
-    ("recording_dropped", _INTEGER, "1", "frames that the recording had no time for"),
-    ("recording_images_dropped", _INTEGER, "1", "images that the recording had no time for, of frames that it has"),
-    ("transforms_unsent", _INTEGER, "1", "before there was a Zenoh session"),
-    ("malformed", _INTEGER, "1", "messages received that were none"),
-    ("frames_per_s", _DOUBLE, "1/s", "rate of the last frames"),
-    ("uptime_s", _DOUBLE, "s", "since the start"),
-    ("camera_connected", _TRUTH, "", "the source is open"),
-    *_shift_columns("of the TCP against the reference"),
-    ("sigma_m", _DOUBLE, "m", "largest standard deviation of the TCP along a camera axis"),
-    ("protection_m", _DOUBLE, "m", "bound on the TCP's position error, of the last transform"),
-    ("valid_by", _TEXT, "", "which error that bounds: reference or absolute"),
-    ("alert_limit_m", _DOUBLE, "m", "position error of the TCP that the task tolerates, as configured"),
-    ("open_alerts", pa.int32(), "1", "alerts raised and not cleared"),
-    ("version", _TEXT, "", "of gripmon"),
-    *_RUN,
-]
-
-_COMMANDS: list[_Column] = [
-    *_WHEN,
-    ("name", _TEXT, "", "of the command"),
-    ("argument", _TEXT, "", "as it was given"),
-    ("done", _TRUTH, "", "false: refused"),
-    ("text", _TEXT, "", "what was done, or why not"),
-    *_RUN,
-]
-
-_REFERENCES: list[_Column] = [
-    ("reference_id", _TEXT, "", "its name, which no other reference has"),
-    ("revision", _INTEGER, "1", "grows by one with every change"),
-    ("time", _TIME, "UTC", "stamp_ns as a time; null for a configured one"),
-    ("stamp_ns", _INTEGER, "ns", "of the newest frame behind it or of the command: Unix; null for a configured one"),
-    ("origin", _TEXT, "", "configuration, recalibration, undo or reset"),
-    *_pose_columns("cam_T_grip", "maps gripper to camera coordinates"),
-    ("covariance", _TRIANGLE, "m2, m rad, rad2", f"of cam_T_grip: {_TRIANGLE_WORDS}"),
-    ("parent", _TEXT, "", "the reference in force before"),
-    ("restores", _TEXT, "", "the earlier one that an undo or reset brought back"),
-    ("cause", _TEXT, "", "what made it necessary"),
-    ("accepted_by", _TEXT, "", "configuration, monitor or operator"),
-    ("first_seq", _INTEGER, "1", "the first frame that was averaged"),
-    ("last_seq", _INTEGER, "1", "the last one"),
-    ("frames_used", _INTEGER, "1", "how many of them were used"),
-    ("weighted_rms", _DOUBLE, "1", "of the residuals over their deviations"),
-    ("step_m", _DOUBLE, "m", "by how much it moved the reference before it"),
-    ("step_rad", _DOUBLE, "rad", "by how much it turned it"),
+_CLOCK = _field("time", _TIME, "UTC", "stamp_ns as a time; null where that is")
+_RUN = [
+    _field("recording_id", pa.string(), "", "the run of the monitor that this is from"),
+    _field("file_number", pa.int32(), "1", "which of the recording's files it is from"),
 ]
 
 
-def _schema(table: str, columns: list[_Column]) -> pa.Schema:
-    fields = [pa.field(name, kind, metadata={"unit": unit, "description": text}) for name, kind, unit, text in columns]
-    units = {name: unit for name, _, unit, _ in columns if unit}
+def _frame_fields() -> Iterator[pa.Field]:
+    """Of the frame table's columns, in their order."""
+    yield _CLOCK
+    for name, column in COLUMNS.items():
+        if column.shape == (7,):
+            yield from _pose_fields(name, column.help)
+        elif column.shape == (3,):
+            yield from _axis_fields(name, column.help)
+            yield from _axis_fields("sigma_m", "standard deviation of the TCP")
+        elif column.shape:
+            yield _triangle_field(name, column.help)
+        elif name == "reference":
+            yield _field("reference_id", pa.string(), "", column.help)
+        else:
+            yield _field(name, pa.string() if column.names else _ARROW[column.type], column.unit, column.help)
+    yield from _RUN
+
+
+def _message_fields(message: type[msgspec.Struct], names: str) -> Iterator[pa.Field]:
+    """Of some of a message's fields."""
+    told = {field.name: field.type for field in _struct(message).fields}
+    for name in names.split():
+        kind: Any = told[name]
+        text = ""
+        if isinstance(kind, kinds.Metadata):
+            kind, text = kind.type, (kind.extra_json_schema or {}).get("description", "")
+        if isinstance(kind, kinds.UnionType):
+            kind = next(one for one in kind.types if not isinstance(one, kinds.NoneType))
+        text = text or _described(kind)
+        if name == "open_alerts":
+            yield _field(name, pa.int32(), "1", text)
+        elif isinstance(kind, kinds.StructType):
+            yield from _pose_fields(name, text)
+        elif isinstance(kind, kinds.TupleType):
+            yield from _axis_fields(name, text)
+        elif isinstance(kind, kinds.VarTupleType) and not isinstance(kind.item_type, kinds.StructType):
+            yield _triangle_field(name, text)
+        else:
+            arrow = _arrow(kind)
+            counted = pa.types.is_integer(arrow) or pa.types.is_floating(arrow) or pa.types.is_list(arrow)
+            unit = next((unit for suffix, unit in _UNITS if name.endswith(suffix)), "1" if counted else "")
+            yield _field(name, arrow, unit, text)
+
+
+def _struct(message: type[msgspec.Struct]) -> kinds.StructType:
+    found = kinds.type_info(message)
+    assert isinstance(found, kinds.StructType)
+    return found
+
+
+def _arrow(kind: kinds.Type) -> pa.DataType:
+    if isinstance(kind, kinds.Metadata):
+        return _arrow(kind.type)
+    if isinstance(kind, kinds.UnionType):
+        return next(_arrow(one) for one in kind.types if not isinstance(one, kinds.NoneType))
+    if isinstance(kind, kinds.VarTupleType):
+        return pa.list_(_arrow(kind.item_type))
+    if isinstance(kind, kinds.StructType):
+        return pa.struct([(field.name, _arrow(field.type)) for field in kind.fields])
+    simple = {kinds.IntType: pa.int64(), kinds.FloatType: pa.float64(), kinds.BoolType: pa.bool_()}
+    return simple.get(type(kind), pa.string())
+
+
+def _described(kind: kinds.Type) -> str:
+    """What a type says of itself, in its first line."""
+    text: str = getattr(kind, "cls", type(kind)).__doc__ or ""
+    return text.partition("\n")[0]
+
+
+def _schema(table: str, fields: Iterable[pa.Field]) -> pa.Schema:
+    fields = list(fields)
     about = {
         "gripmon.schema": f"gripmon.export.{table}/1",
         "gripmon.version": __version__,
-        "gripmon.units": json.dumps(units),
+        "gripmon.units": json.dumps({f.name: unit for f in fields if (unit := f.metadata[b"unit"].decode())}),
     }
     return pa.schema(fields, metadata=about)
 
 
+def _dated_schema(table: str, message: type[msgspec.Struct], names: str) -> pa.Schema:
+    return _schema(table, [_CLOCK, *_message_fields(message, f"stamp_ns seq {names}"), *_RUN])
+
+
+_INPUTS = {
+    "first_seq": "first_seq", "last_seq": "last_seq", "frames": "frames_used", "weighted_rms": "weighted_rms",
+    "step_m": "step_m", "step_rad": "step_rad",
+}  # fmt: skip
+"""Of what a reference was made from: a column each."""
+
 SCHEMAS: dict[str, pa.Schema] = {
-    "frames": _schema("frames", _FRAMES),
-    "alerts": _schema("alerts", _ALERTS),
-    "states": _schema("states", _STATES),
-    "commands": _schema("commands", _COMMANDS),
-    "references": _schema("references", _REFERENCES),
-}
+    "frames": _schema("frames", _frame_fields()),
+    "alerts": _dated_schema(
+        "alerts", AlertRecord,
+        "event alert_id kind cause part severity text causes tcp_shift_m rotation_rad rate_m_per_min time_left_s "
+        "since_ns acknowledged state reference_id revision",
+    ),
+    "states": _dated_schema(
+        "states", StateRecord,
+        "state verdict message reference_id revision frames frames_refused frames_dropped recording_dropped "
+        "recording_images_dropped transforms_unsent malformed frames_per_s uptime_s camera_connected tcp_shift_m "
+        "sigma_m protection_m valid_by alert_limit_m open_alerts version",
+    ),
+    "commands": _dated_schema("commands", RecordedCommand, "name argument done text"),
+    "references": _schema(
+        "references",
+        [
+            *_message_fields(ReferenceRecord, "reference_id revision"),
+            _CLOCK,
+            *_message_fields(
+                ReferenceRecord, "stamp_ns origin cam_T_grip covariance parent restores cause accepted_by"
+            ),
+            *(f.with_name(_INPUTS.get(f.name, f.name)) for f in _message_fields(ReferenceInputs, " ".join(_INPUTS))),
+        ],
+    ),
+}  # fmt: skip
 """The columns of each table; within a major version columns may be added, not renamed or dropped."""
 _DATED = ("alerts", "states", "commands")
 
@@ -278,7 +269,7 @@ class Exporter:
 
     def add(self, part: Recording, path: Path) -> None:
         """Export the file ``path`` of a recording.  Raises OSError if the result can't be written."""
-        recording_id, number = part.recording_id, file_number(part.meta, path) or 0
+        recording_id, number = part.recording_id, file_number(part.meta)
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
         known = self._from.setdefault((part.robot, part.camera, name), path)
         if known != path:
@@ -287,9 +278,9 @@ class Exporter:
         frames = part.frames.take(np.argsort(part.frames.stamp_ns, kind="stable"))
 
         where = f"robot={_escaped(part.robot)}/camera={_escaped(part.camera)}"
-        tables = {table: _dated(table, getattr(part, table), recording_id, number) for table in _DATED}
+        tables = {table: _dated_rows(table, getattr(part, table), recording_id, number) for table in _DATED}
         self._by_day(
-            "frames", where, name, frames.stamp_ns, lambda rows: frame_rows(frames.take(rows), recording_id, number)
+            "frames", where, name, frames.stamp_ns, lambda rows: _frame_rows(frames.take(rows), recording_id, number)
         )
         for table, made in tables.items():
             self._by_day(table, where, name, made["stamp_ns"].to_numpy(), made.__getitem__)
@@ -315,7 +306,7 @@ class Exporter:
         path = self.out / "references" / where / name
         if path not in self._references:
             self._references.add(path)
-            _write(path, SCHEMAS["references"], [reference_row(reference)])
+            _write(path, SCHEMAS["references"], [_reference_row(reference)])
             self.rows["references"] += 1
 
 
@@ -345,71 +336,40 @@ def _file_name(value: str) -> str:
     return f"{plain or 'run'}-{hashlib.sha256(value.encode()).hexdigest()[:8]}"
 
 
-def frame_rows(frames: FrameTable, recording_id: str, file_number: int) -> pa.Table:
+def _frame_rows(frames: FrameTable, recording_id: str, number: int) -> pa.Table:
     """The table ``frames``, one row per frame, in the given order.  NaN and -1 (unknown) become null."""
     with np.errstate(invalid="ignore"):  # a value that is not a covariance has no standard deviation
         sigma_m = np.sqrt(np.diagonal(frames.covariance, axis1=1, axis2=2)[:, :3])
-    axes = [f"{axis}_m" for axis in _AXES]
-    poses = (("cam_T_grip", frames.cam_T_grip, POSE_NAMES), ("smoothed", frames.smoothed, POSE_NAMES),
-             ("absolute", frames.absolute, POSE_NAMES),
-             ("tcp_shift", frames.tcp_shift_m, axes), ("sigma", sigma_m, axes))  # fmt: skip
-    columns: dict[str, Any] = {
+    arrays: dict[str, Any] = {
         "time": pa.array(frames.stamp_ns, pa.int64()).cast(_TIME),
-        "verdict": _named(frames.verdict, frames.VERDICTS),
-        "state": _named(frames.state, frames.STATES),
-        "source": _named(frames.source, frames.ORIGINS),
-        "valid_by": _named(frames.valid_by, frames.VALID_BY),
-        "since": _named(frames.since, frames.SINCE),
-        "since_ns": pa.array(frames.since_ns, mask=frames.since_ns < 0),
-        **{f"{name}_{part}": _number(values[:, i]) for name, values, parts in poses for i, part in enumerate(parts)},
-        "covariance": _triangle(frames.covariance),
-        "smoothed_covariance": _triangle(frames.smoothed_covariance),
         "reference_id": _named(frames.reference, frames.reference_ids),
-        "revision": pa.array(frames.revision, mask=frames.revision < 0),
-        "latency_ns": pa.array(frames.latency_ns, mask=frames.latency_ns < 0),
         "recording_id": pa.repeat(recording_id, len(frames)),
-        "file_number": pa.repeat(pa.scalar(file_number, pa.int32()), len(frames)),
+        "file_number": pa.repeat(pa.scalar(number, pa.int32()), len(frames)),
+        **_numbers(_axis_names("sigma_m"), sigma_m),
     }
-    for field in SCHEMAS["frames"]:
-        if field.name not in columns:
-            values = getattr(frames, field.name)
-            columns[field.name] = _number(values) if values.dtype == np.float64 else pa.array(values)
-    return pa.table([columns[field.name] for field in SCHEMAS["frames"]], schema=SCHEMAS["frames"])
+    for name, column in COLUMNS.items():
+        values = getattr(frames, name)
+        if column.shape == (6, 6):
+            upper = values.reshape(-1, 36)[:, UPPER]
+            known = pa.array(np.isnan(upper).any(axis=1))
+            arrays[name] = pa.FixedSizeListArray.from_arrays(pa.array(upper.reshape(-1)), type=_TRIANGLE, mask=known)
+        elif column.shape:
+            arrays |= _numbers(_pose_names(name) if column.shape == (7,) else _axis_names(name), values)
+        elif column.names:
+            arrays[name] = _named(values, column.names)
+        elif column.type is np.float64:
+            arrays |= _numbers([name], values[:, None])
+        else:
+            arrays[name] = pa.array(values, mask=values < 0 if name in _MAY_BE_UNKNOWN else None)
+    return pa.table([arrays[name] for name in SCHEMAS["frames"].names], schema=SCHEMAS["frames"])
 
 
-def _dated(table: str, records: Iterable[Any], recording_id: str, file_number: int) -> pa.Table:
-    """The table ``alerts``, ``states`` or ``commands``, in order of time."""
-    rows = []
-    for record in sorted(records, key=lambda record: int(record.stamp_ns)):
-        row = _values(record)
-        row |= {f"tcp_shift_{axis}_m": v for axis, v in zip(_AXES, row.get("tcp_shift_m") or (), strict=False)}
-        if "open_alerts" in row:
-            row["open_alerts"] = len(row["open_alerts"])
-        rows.append(row | {"time": record.stamp_ns, "recording_id": recording_id, "file_number": file_number})
-    return pa.Table.from_pylist(rows, SCHEMAS[table])
+_MAY_BE_UNKNOWN = ("since_ns", "revision", "latency_ns")
 
 
-def reference_row(reference: ReferenceRecord) -> pa.Table:
-    """The one row of a reference."""
-    row = _values(reference)
-    inputs = {} if reference.inputs is None else _values(reference.inputs)
-    stamp_ns = reference.stamp_ns or None  # 0: configured, at an unknown time
-    row |= {"stamp_ns": stamp_ns, "time": stamp_ns, "frames_used": inputs.pop("frames", None), **inputs}
-    pose = reference.cam_T_grip
-    values = (*pose.translation_m, *pose.rotation_xyzw)
-    row |= {f"cam_T_grip_{part}": value for part, value in zip(POSE_NAMES, values, strict=True)}
-    row |= {"covariance": [reference.covariance[i] for i in UPPER]}
-    return pa.Table.from_pylist([row], SCHEMAS["references"])
-
-
-def _values(record: msgspec.Struct) -> dict[str, Any]:
-    given = {name: value for name, value in msgspec.structs.asdict(record).items() if value is not msgspec.UNSET}
-    values: dict[str, Any] = msgspec.to_builtins(given)
-    return values
-
-
-def _number(values: NDArray[np.float64]) -> pa.Array:
-    return pa.array(np.ascontiguousarray(values), mask=np.isnan(values))
+def _numbers(names: Sequence[str], values: NDArray[np.float64]) -> dict[str, pa.Array]:
+    columns = map(np.ascontiguousarray, values.T)
+    return {name: pa.array(one, mask=np.isnan(one)) for name, one in zip(names, columns, strict=True)}
 
 
 def _named(codes: NDArray[Any], names: tuple[str, ...]) -> pa.Array:
@@ -417,8 +377,33 @@ def _named(codes: NDArray[Any], names: tuple[str, ...]) -> pa.Array:
     return pa.DictionaryArray.from_arrays(indices, pa.array(names, pa.string())).cast(pa.string())
 
 
-def _triangle(covariance: NDArray[np.float64]) -> pa.Array:
-    upper = covariance.reshape(-1, 36)[:, UPPER]
-    return pa.FixedSizeListArray.from_arrays(
-        pa.array(upper.reshape(-1)), type=_TRIANGLE, mask=pa.array(np.isnan(upper).any(axis=1))
-    )
+def _dated_rows(table: str, records: Iterable[Any], recording_id: str, number: int) -> pa.Table:
+    """The table ``alerts``, ``states`` or ``commands``, in order of time."""
+    run = {"recording_id": recording_id, "file_number": number}
+    ordered = sorted(records, key=lambda record: int(record.stamp_ns))
+    rows = [{**_row(record), "time": record.stamp_ns, **run} for record in ordered]
+    return pa.Table.from_pylist(rows, SCHEMAS[table])
+
+
+def _reference_row(reference: ReferenceRecord) -> pa.Table:
+    """The one row of a reference."""
+    row = _row(reference)
+    inputs = row["inputs"] or {}
+    stamp_ns = reference.stamp_ns or None  # 0: configured, at an unknown time
+    row |= {"stamp_ns": stamp_ns, "time": stamp_ns, **{name: inputs.get(of) for of, name in _INPUTS.items()}}
+    return pa.Table.from_pylist([row], SCHEMAS["references"])
+
+
+def _row(record: msgspec.Struct) -> dict[str, Any]:
+    """A message's values by column."""
+    row: dict[str, Any] = {}
+    for name, value in msgspec.structs.asdict(record).items():
+        if isinstance(value, Transform):
+            row |= zip(_pose_names(name), (*value.translation_m, *value.rotation_xyzw), strict=True)
+        elif name == "tcp_shift_m" and value is not None:
+            row |= zip(_axis_names(name), value, strict=True)
+        elif name == "covariance":
+            row[name] = [value[i] for i in UPPER]
+        else:
+            row[name] = len(value) if name == "open_alerts" else msgspec.to_builtins(value)
+    return row

@@ -17,9 +17,10 @@ import numpy as np
 
 from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
-from gripmon.record.container import MAGIC, RrdFile, UnreadableFileError
-from gripmon.record.contents import Contents, LineFile, read_contents, read_lines
-from gripmon.record.recordings import Recording, Shot, decode_image
+from gripmon.record.container import MAGIC
+from gripmon.record.contents import Contents, LineFile, Shot, contents_of
+from gripmon.record.recordings import Recording, decode_image
+from gripmon.record.rrd import RrdFile, UnreadableFileError
 
 Progress = Callable[[int, int], None]
 _SUFFIX, _LINES_SUFFIX = ".rrd", ".jsonl"
@@ -160,10 +161,9 @@ def _distinct(paths: Iterable[Path], faults: list[str]) -> dict[Path, int]:
 def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Contents]:
     """What a file contains of each recording; faults are added to ``faults``."""
     try:
-        if path.suffix.lower() == _LINES_SUFFIX and not is_rrd(path):
-            return [read_lines(LineFile(path), step)]
-        file = RrdFile(path)
-        found = [read_contents(file, store, step) for store in file.stores]
+        lines = path.suffix.lower() == _LINES_SUFFIX and not is_rrd(path)
+        file = LineFile(path) if lines else RrdFile(path)
+        found = contents_of(file, step)
     except UnreadableFileError as error:
         faults.append(f"{path}: {error}; not used")
         return []
@@ -177,7 +177,7 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
     if not ours and any(contents.is_of_spots for contents in found):
         faults.append(f"{path}: holds laser spots of an earlier version, no frames; gripmon view shows them; not used")
     elif not ours:
-        applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
+        applications = ", ".join(sorted({repr(contents.store.application)[:60] for contents in found}))
         what = f"is a recording of the application {applications} that holds no frames of a monitor's"
         faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))
     return ours
@@ -192,10 +192,10 @@ class RecordedFrames:
     and a replay comes close.  A frame that was refused because it was not an image, or not of this camera, has no image
     in the recording.  It is replayed from its record: without image, with the same refusal in the same words.
 
-    Images are read when they are needed.  ``faults``, one line each: what in the files could not be used;
-    ``passed_over`` counts frames that could no longer be read, ``images_damaged`` those whose pixels can't be decoded.
-    Raises :class:`~gripmon.model.errors.NoResultError` if there is no image at all, and
-    :class:`~gripmon.model.errors.InputError` for files of several runs, whose frames have no common order.
+    Images are read when they are needed; ``passed_over`` counts frames that could no longer be read,
+    ``images_damaged`` those whose pixels can't be decoded.  Raises :class:`~gripmon.model.errors.NoResultError` if
+    there is no image at all, and :class:`~gripmon.model.errors.InputError` for files of several runs, whose frames have
+    no common order.
     """
 
     live = False
@@ -203,19 +203,20 @@ class RecordedFrames:
     dropped = 0
 
     def __init__(self, paths: Path | Sequence[Path]) -> None:
-        self._run, self.faults = _one_run([paths] if isinstance(paths, Path) else list(paths))
+        self._run, self._unused = _one_run([paths] if isinstance(paths, Path) else list(paths))
         run = self._run
         self.paths: tuple[Path, ...] = run.files
         self.configuration: RecordedConfiguration | None = run.configuration
         self.reference: ReferenceRecord | None = run.references[0] if run.references else None
         """The reference in force when the first of these files began."""
         self.commands: tuple[RecordedCommand, ...] = tuple(sorted(run.commands, key=attrgetter("seq", "stamp_ns")))
-        if not len(run.image_seqs):
+        self._images = run.images()
+        if not self._images:
             no_images = f"{self.paths[0]}: holds no images; a recording made with image_rate_hz above 0"
             raise NoResultError("; ".join([*[no_images] * bool(len(run.frames)), *self.faults]) or no_images)
-        with_image = np.isin(run.frames.seq, run.image_seqs)
+        with_image = np.isin(run.frames.seq, list(self._images))
         refused = run.frames.seq[run.frames.refused & ~with_image]
-        stand_ins = [record.seq for record in run.records(refused) if _stands_in(record)] if len(refused) else []
+        stand_ins = [record.seq for record in run.records(refused) if _stands_in(record)]
         # An image without a record, at the end of a truncated recording, was never judged.
         self._seqs = run.frames.seq[with_image | np.isin(run.frames.seq, stand_ins)]
         self.frames_without_image = len(run.frames) - len(self._seqs)
@@ -230,6 +231,11 @@ class RecordedFrames:
     def __len__(self) -> int:
         return len(self._seqs)
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """One line each: what in the files could not be used."""
+        return (*self._unused, *self._run.faults)
+
     def read(self) -> Frame | None:
         """The next frame, None after the last."""
         return next(self._given, None)
@@ -240,8 +246,7 @@ class RecordedFrames:
 
     def _frames(self) -> Generator[Frame]:
         given = 0
-        for record in self._run.records(self._seqs):
-            shot = self._run.shot(record.seq)
+        for record, shot in self._run.with_shots(self._seqs, self._images):
             if shot is None and not _stands_in(record):
                 continue
             self.shot, self.record = shot, record
@@ -259,12 +264,12 @@ class RecordedFrames:
             image = decode_image(shot.blob)
             fault = None if image is not None else "the recorded image is damaged"
             self.images_damaged += image is None
-        jaw_m = self._run.jaw_reported_m(record.seq) if shot is None else shot.jaw_reported_m
+        jaw_m = self._run.jaw_reported_m(record.seq)
         return Frame(record.seq, record.stamp_ns, image, jaw_m, record.name, fault, refused)
 
 
 def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
-    """The run that all files belong to, and what is wrong with them."""
+    """The run that all files belong to, and what is said of others."""
     found = open_recordings(paths)
     if not found.recordings:
         raise NoResultError("; ".join(found.faults) or "there is no recording; an .rrd file of gripmon's")
@@ -273,7 +278,7 @@ def _one_run(paths: Sequence[Path]) -> tuple[Recording, tuple[str, ...]]:
         more = ", …" if len(found.recordings) > 4 else ""
         raise InputError(f"these are files of {len(found.recordings)} runs ({first}{more}); the files of one")
     (run,) = found.recordings
-    return run, (*found.faults, *run.faults)
+    return run, found.faults
 
 
 def _stands_in(record: FrameRecord) -> bool:

@@ -4,14 +4,11 @@ missing or contradictory.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -31,13 +28,17 @@ from gripmon.model.records import (
     StateRecord,
 )
 from gripmon.record import contents as entities
-from gripmon.record.container import Span
-from gripmon.record.contents import Contents, decoded, frame_numbers
-from gripmon.record.table import FrameTable, IntArray, TableBuilder
+from gripmon.record.contents import Contents, Shot, records_of, rows_of, shots_of
+from gripmon.record.table import OTHER, FrameTable, IntArray, TableBuilder
 
 UNKNOWN = "unknown"
-_SPANS_KEPT = 16
-_NUMBERED = re.compile(r"-(\d{4,9})$")
+_POINTS = "Points2D:positions"
+_DRAWN = {
+    entities.EDGES_USED: _POINTS,
+    entities.EDGES_REFUSED: _POINTS,
+    entities.PREDICTED_CORNERS: _POINTS,
+    entities.PREDICTED_EDGES: entities.STRIPS,
+}
 Pixels = NDArray[np.float32]
 
 
@@ -61,53 +62,29 @@ class Picture:
     corners: tuple[CornerRecord, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A recorded image as stored in the file, with the jaw opening that came with the frame.
+@dataclass(slots=True)
+class _Drawing:
+    """What is shown of a frame: its image, its record, what is drawn on the image, by entity."""
 
-    ``blob``: bytes of a JPEG or PNG; ``jaw_reported_m``: None if no opening was reported.
-    """
+    shot: Shot | None = None
+    record: FrameRecord | None = None
+    drawn: dict[str, list[Any]] = field(default_factory=dict)
 
-    seq: int
-    stamp_ns: int
-    blob: bytes
-    media_type: str
-    jaw_reported_m: float | None
-
-
-class _Row(NamedTuple):
-    batch: Any
-    number: int
-
-    def scalar(self, component: str) -> Any:
-        """The Arrow scalar; None if the component is missing."""
-        return self.batch.column(component)[self.number] if component in self.batch.schema.names else None
-
-    def value(self, component: str) -> Any:
-        """The Python value; None if the component is missing or empty in this row."""
-        found = self.scalar(component)
-        return None if found is None else found.as_py()
+    def points(self, entity: str) -> Pixels:
+        return np.array(self.drawn.get(entity, []), np.float32).reshape(-1, 2)
 
 
 class Recording:
     """One run of one monitor: all given files of it, joined in the order of frame numbers.
 
-    ``frames`` has each number once.  ``meta`` is None for files that are older than it; ``robot`` and ``camera`` are
-    ``unknown`` if the files don't name them.  ``alerts`` are those of the frame records and the daemon's own.
-    ``faults``, one line each: what is wrong, in which file, and what was used.  Of these, ``file_faults`` concern one
-    file regardless of the rest of its run, and ``gaps`` are about missing frame numbers.
+    ``frames`` has each number once.  ``robot`` and ``camera`` are ``unknown`` if the files don't name them.  ``alerts``
+    are those of the frame records and the daemon's own.  ``image_seqs``: frames whose image was recorded;
+    ``overlay_seqs``: those with an outline drawn on it.
     """
 
     def __init__(self, contents: Sequence[Contents]) -> None:
         """All parts of one recording, at least one."""
         self._parts = parts = tuple(sorted(contents, key=_place_in_run))
-        faults = [f"{part.path}: {fault}" for part in parts for fault in part.faults]
-        self.file_faults: tuple[str, ...] = tuple(faults)
-        # If the last file of a run was begun and got no frames, nothing is lost.
-        empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
-        faults += [f"{part.path}: holds no frames" for part in empty]
-        faults += _missing_files(parts)
-        self._batches = functools.lru_cache(_SPANS_KEPT)(functools.partial(_batches, parts))
         self.recording_id: str = parts[0].recording_id
         self.meta: Meta | None = next((part.meta for part in parts if part.meta is not None), None)
         self.files: tuple[Path, ...] = tuple(part.path for part in parts)
@@ -115,70 +92,138 @@ class Recording:
         self.commands: tuple[RecordedCommand, ...] = _events(parts, entities.COMMAND, "seq")
         self.states: tuple[StateRecord, ...] = _events(parts, entities.STATE, "seq")
         self.configuration: RecordedConfiguration | None = next(
-            (found for part in parts for found in part.events.get(entities.CONFIGURATION, ())), None
+            (found for part in parts for found in part.events(entities.CONFIGURATION)), None
         )
-        self.robot, self.camera = _names(parts, self.meta, self.states)
+        named: Any = next((n for n in (self.meta, *self.states, *_events(parts, entities.ALERT, "seq")) if n), None)
+        self.robot: str = UNKNOWN if named is None else named.robot
+        self.camera: str = UNKNOWN if named is None else named.camera
         self.alerts: tuple[AlertRecord, ...] = _alerts(parts, self.robot, self.camera)
-        self.image_seqs: IntArray = np.unique(np.concatenate([part.image_seqs for part in parts]))
-        # In which messages (a part's number and a span of its file) each row of ``frames`` lies.
-        self._spans = [(number, span) for number, part in enumerate(parts) for span in part.record_spans]
-        self.frames, self._rows_span, repeated = _frames(parts)
-        faults += repeated
+        self.image_seqs: IntArray = np.array(sorted(set().union(*(part.image_seqs for part in parts))), np.int64)
+        self.overlay_seqs: IntArray = np.array(sorted(set().union(*(part.overlay_seqs for part in parts))), np.int64)
+        # If the last file of a run was begun and got no frames, nothing is lost.
+        empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
+        self._wrong = [f"{part.path}: holds no frames" for part in empty] + _missing_files(parts)
+        self.frames, self._part_of, repeated = _frames(parts)
+        self._wrong += repeated
+        unknown = (self.frames.state == FrameTable.STATES.index(OTHER)) | (
+            self.frames.source == FrameTable.ORIGINS.index(OTHER)
+        )
+        if unknown.any():
+            where = self._file_of(int(np.argmax(unknown)))
+            self._wrong.append(f"{where}: has frames with a state or source that this version doesn't know")
         self.gaps: tuple[str, ...] = self._gaps()
-        self.faults: tuple[str, ...] = (*faults, *self.gaps, *self._backwards())
+        self._drawings: dict[int, _Drawing] = {}
 
     def __repr__(self) -> str:
         return f"Recording({self.recording_id}: {len(self.frames)} frames, {len(self.image_seqs)} images)"
 
+    @property
+    def file_faults(self) -> tuple[str, ...]:
+        """Faults of one file regardless of the rest of its run, as far as they are known yet."""
+        return tuple(f"{part.path}: {fault}" for part in self._parts for fault in part.faults)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """One line each: what is wrong, in which file, and what was used; ``gaps``, about missing frames, too."""
+        return (*self.file_faults, *self._wrong, *self.gaps, *self._backwards())
+
     def records(self, seqs: IntArray | None = None) -> Iterator[FrameRecord]:
         """Frame records, decoded again, in the order of their numbers; of all frames, or of ``seqs`` (ascending).
 
-        Records of another version have the fields that this one knows; a record that can't be understood, or whose file
-        can no longer be read, is skipped.
+        A record whose file can no longer be read is skipped.
         """
-        rows = np.arange(len(self.frames))
-        if seqs is not None:
-            rows = np.flatnonzero(np.isin(self.frames.seq, seqs))
-        breaks = np.flatnonzero(np.diff(self._rows_span[rows])) + 1
-        for run in np.split(rows, breaks) if len(rows) else []:
-            wanted = self.frames.seq[run].tolist()
-            part, span = self._spans[int(self._rows_span[run[0]])]
-            found = self._records_of(part, span, set(wanted))
-            yield from (found[seq] for seq in wanted if seq in found)
+        for record, _ in self._in_order(self.frames.seq if seqs is None else seqs, {}):
+            yield record
+
+    def with_shots(
+        self, seqs: IntArray, images: dict[int, int] | None = None
+    ) -> Iterator[tuple[FrameRecord, Shot | None]]:
+        """As :meth:`records`, each with its image, None where there is none; ``images``: :meth:`images` if it is known.
+        Every file is read once, and an image that was recorded later than its frame is waited for.
+        """
+        yield from self._in_order(seqs, self.images() if images is None else images)
+
+    def prepare(self, seqs: Sequence[int]) -> None:
+        """Read what :meth:`picture` is to show of these frames, in one pass a file."""
+        missing = [seq for seq in seqs if seq not in self._drawings]
+        self._drawings |= {seq: _Drawing() for seq in missing}
+        wanted = np.array(missing, np.int64)
+        for part in self._parts:
+            if not part.has(wanted):
+                continue
+            for entity, batch in part.rows((entities.RECORD, entities.IMAGE, *_DRAWN), wanted):
+                self._draw(entity, batch)
 
     def picture(self, seq: int) -> Picture | None:
         """The image of a frame with its overlay; None if there is none, it is damaged, or its file is gone."""
-        shot = self.shot(seq)
+        self.prepare([seq])
+        drawing = self._drawings[seq]
+        shot, record = drawing.shot, drawing.record
         image = None if shot is None else decode_image(shot.blob)
         if shot is None or image is None:
             return None
-        record = next(self.records(np.array([seq])), None)
+        strips = drawing.drawn.get(entities.PREDICTED_EDGES, [])
         return Picture(
             seq=seq,
             stamp_ns=shot.stamp_ns,
             image=image,
             media_type=shot.media_type,
-            edges_used=self._points(entities.EDGES_USED, seq),
-            edges_refused=self._points(entities.EDGES_REFUSED, seq),
-            predicted_edges=self._strips(entities.PREDICTED_EDGES, seq),
-            predicted_corners=self._points(entities.PREDICTED_CORNERS, seq),
+            edges_used=drawing.points(entities.EDGES_USED),
+            edges_refused=drawing.points(entities.EDGES_REFUSED),
+            predicted_edges=tuple(np.array(strip, np.float32).reshape(-1, 2) for strip in strips if strip),
+            predicted_corners=drawing.points(entities.PREDICTED_CORNERS),
             corners=() if record is None else record.corners,
         )
 
-    def shot(self, seq: int) -> Shot | None:
-        """The recorded image of a frame; None if there is none, or its file is gone."""
-        row = self._row(entities.IMAGE, seq)
-        if row is None:
-            return None
-        stamp, kinds = row.scalar("capture_time"), row.value("EncodedImage:media_type")
-        stamp_ns = 0 if stamp is None else stamp.value or 0
-        return Shot(seq, stamp_ns, _blob(row), kinds[0] if kinds else "", self.jaw_reported_m(seq))
-
     def jaw_reported_m(self, seq: int) -> float | None:
         """The jaw opening that was reported with a frame, m; None if there was none."""
-        row = self._row(entities.JAW_REPORTED, seq)
-        openings_m = None if row is None else row.value("Scalars:scalars")
-        return openings_m[0] if openings_m else None
+        return next((part.jaw[seq] for part in self._parts if seq in part.jaw), None)
+
+    def _draw(self, entity: str, batch: Any) -> None:
+        for shot in shots_of(batch) if entity == entities.IMAGE else ():
+            self._drawings[shot.seq].shot = self._drawings[shot.seq].shot or shot
+        for record in records_of(batch) if entity == entities.RECORD else ():
+            self._drawings[record.seq].record = self._drawings[record.seq].record or record
+        for seq, values in rows_of(batch, _DRAWN[entity]) if entity in _DRAWN else ():
+            self._drawings[seq].drawn.setdefault(entity, values.as_py())
+
+    def images(self) -> dict[int, int]:
+        """The frames whose image can be read, and the number of the part that it is in.  Reads all images."""
+        found: dict[int, int] = {}
+        for number, part in enumerate(self._parts):
+            for _, batch in part.rows((entities.IMAGE,), component=entities.MEDIA_TYPE):
+                for seq, _ in rows_of(batch, entities.MEDIA_TYPE):
+                    found.setdefault(seq, number)
+        return found
+
+    def _in_order(self, seqs: IntArray, there: dict[int, int]) -> Iterator[tuple[FrameRecord, Shot | None]]:
+        """Records by number, with the images that are ``there``; what comes too early waits in memory."""
+        rows = np.flatnonzero(np.isin(self.frames.seq, seqs))
+        wanted = self.frames.seq[rows].tolist()
+        known = set(wanted)
+        again = (
+            (number, each)
+            for number, part in enumerate(self._parts)
+            if part.has(seqs)
+            for each in part.again(seqs, images=bool(there))
+            if each.seq in known
+        )
+        records: dict[int, FrameRecord] = {}
+        shots: dict[int, Shot] = {}
+        reached = 0
+        for seq, part_number in zip(wanted, self._part_of[rows].tolist(), strict=True):
+            last = max(part_number, there.get(seq, 0))
+            while reached <= last and (seq not in records or (seq in there and seq not in shots)):
+                reached, each = next(again, (len(self._parts), None))
+                if each is None or each.seq < seq:
+                    continue
+                if isinstance(each, Shot):
+                    shots.setdefault(each.seq, each)
+                else:
+                    records.setdefault(each.seq, each)
+            shot = shots.pop(seq, None)
+            if seq in records:
+                yield records.pop(seq), shot
 
     def _gaps(self) -> tuple[str, ...]:
         missing = np.diff(self.frames.seq) - 1
@@ -202,52 +247,8 @@ class Recording:
         return (f"{self._file_of(row)}: {back}; frames were taken in the order of their numbers",)
 
     def _file_of(self, row: int) -> Path:
-        return self._parts[self._spans[self._rows_span[row]][0]].path
+        return self._parts[self._part_of[row]].path
 
-    def _records_of(self, part: int, span: Span, wanted: set[int]) -> dict[int, FrameRecord]:
-        contents = self._parts[part]
-        try:
-            texts = contents.source.record_texts(contents.store, span)
-        except OSError:
-            return {}
-        found: dict[int, FrameRecord] = {}
-        for text in texts:
-            try:
-                record, _ = decoded(text, FrameRecord)
-            except ValueError:
-                continue
-            if record.seq in wanted:
-                found.setdefault(record.seq, record)
-        return found
-
-    def _row(self, entity: str, seq: int) -> _Row | None:
-        """The row of a frame in an entity, from the first file that has it."""
-        for number, contents in enumerate(self._parts):
-            for span in contents.places[entity].find(seq) if entity in contents.places else ():
-                for batch in self._batches(number, span).get(entity, ()):
-                    rows = np.flatnonzero(frame_numbers(batch) == seq)
-                    if len(rows):
-                        return _Row(batch, int(rows[0]))
-        return None
-
-    def _points(self, entity: str, seq: int) -> Pixels:
-        row = self._row(entity, seq)
-        points = None if row is None else row.value("Points2D:positions")
-        return np.array(points or [], np.float32).reshape(-1, 2)
-
-    def _strips(self, entity: str, seq: int) -> tuple[Pixels, ...]:
-        row = self._row(entity, seq)
-        strips = None if row is None else row.value("LineStrips2D:strips")
-        return tuple(np.array(strip, np.float32).reshape(-1, 2) for strip in strips or () if strip)
-
-
-def _batches(parts: Sequence[Contents], part: int, span: Span) -> dict[str, list[Any]]:
-    """A message's rows by entity."""
-    found: dict[str, list[Any]] = {}
-    with contextlib.suppress(OSError):
-        for chunk in parts[part].source.decode(parts[part].store, span, entities.ON_DEMAND):
-            found.setdefault(chunk.entity, []).append(chunk.batch)
-    return found
 
 
 def decode_image(blob: bytes) -> Image | None:
@@ -263,33 +264,18 @@ def decode_image(blob: bytes) -> Image | None:
     return image
 
 
-def _blob(row: _Row) -> bytes:
-    value = row.scalar("EncodedImage:blob")
-    if value is None or not value.is_valid or not len(value.values):
-        return b""
-    first = value.values[0]
-    return bytes(first.values.to_numpy().tobytes()) if hasattr(first, "values") else bytes(first.as_py() or b"")
-
-
-def file_number(meta: Meta | None, path: Path) -> int | None:
-    """The number of a file in its run; older files have it only in their names."""
-    if meta is not None:
-        return meta.file_number
-    found = _NUMBERED.search(path.stem)
-    return int(found[1]) if found else None
+def file_number(meta: Meta | None) -> int:
+    """The number of a file in its run; 0: it has none."""
+    return 0 if meta is None else meta.file_number
 
 
 def _place_in_run(part: Contents) -> tuple[int, int, str]:
-    return file_number(part.meta, part.path) or 0, part.frames.first_seq, str(part.path)
+    return file_number(part.meta), part.frames.first_seq, str(part.path)
 
 
 def _missing_files(parts: Sequence[Contents]) -> list[str]:
     """Missing file numbers, where frames are missing there, too: files may have been merged."""
-    numbered = [
-        (number, part)
-        for part in parts
-        if (number := file_number(part.meta, part.path)) is not None and len(part.frames)
-    ]
+    numbered = [(part.meta.file_number, part) for part in parts if part.meta is not None and len(part.frames)]
     faults = []
     before, last = 0, -1
     for number, part in numbered:
@@ -302,17 +288,8 @@ def _missing_files(parts: Sequence[Contents]) -> list[str]:
 
 def _events(parts: Sequence[Contents], entity: str, order: str) -> tuple[Any, ...]:
     """The events of an entity, each once, in the given order."""
-    found = dict.fromkeys(event for part in parts for event in part.events.get(entity, ()))
+    found = dict.fromkeys(event for part in parts for event in part.events(entity))
     return tuple(sorted(found, key=attrgetter(order)))
-
-
-def _names(parts: Sequence[Contents], meta: Meta | None, states: Sequence[StateRecord]) -> tuple[str, str]:
-    """Robot and camera."""
-    if meta is not None:
-        return meta.robot, meta.camera
-    for event in (*states, *_events(parts, entities.ALERT, "seq")):
-        return event.robot, event.camera
-    return next((part.about for part in parts if part.about is not None), (UNKNOWN, UNKNOWN))
 
 
 def _alerts(parts: Sequence[Contents], robot: str, camera: str) -> tuple[AlertRecord, ...]:
@@ -335,29 +312,27 @@ def _alerts(parts: Sequence[Contents], robot: str, camera: str) -> tuple[AlertRe
         for record in records.values()
         for alert in record.alerts
     ]
-    own = (alert for part in parts for alert in part.events.get(entities.ALERT, ()))
+    own = (alert for part in parts for alert in part.events(entities.ALERT))
     return tuple(sorted(dict.fromkeys((*found, *own)), key=attrgetter("seq")))
 
 
 def _frames(parts: Sequence[Contents]) -> tuple[FrameTable, IntArray, list[str]]:
-    """The frames of all parts in the order of their numbers, each once (from the first file that has it); the index of
-    each one's span, counted over all parts; and a description of repeated frames.
+    """The frames of all parts in the order of their numbers, each once (from the first part that has it); the number of
+    each one's part; and a description of repeated frames.
     """
-    counts = [len(part.record_spans) for part in parts]
-    begins = np.cumsum([0, *counts[:-1]])
-    rows_span = np.concatenate([part.record_span + begin for part, begin in zip(parts, begins, strict=True)])
+    part_of = np.repeat(np.arange(len(parts)), [len(part.frames) for part in parts])
     table = TableBuilder.join([part.frames for part in parts])
     if np.all(np.diff(table.seq) > 0):
-        return table, rows_span, []
+        return table, part_of, []
     order = np.argsort(table.seq, kind="stable")
     again = np.concatenate([[False], np.diff(table.seq[order]) == 0])
-    repeated = _repeated(parts, table, order, again, np.repeat(np.arange(len(parts)), counts)[rows_span])
+    repeated = _repeated(parts, table, order, again, part_of)
     kept = order[~again]
-    return table.take(kept), rows_span[kept], repeated
+    return table.take(kept), part_of[kept], repeated
 
 
 def _repeated(
-    parts: Sequence[Contents], table: FrameTable, order: IntArray, again: NDArray[np.bool_], rows_part: IntArray
+    parts: Sequence[Contents], table: FrameTable, order: IntArray, again: NDArray[np.bool_], part_of: IntArray
 ) -> list[str]:
     """``again`` (n,) marks the rows in ``order`` that have the same number as the row before."""
     twice = np.flatnonzero(again)
@@ -368,10 +343,10 @@ def _repeated(
     ).all(axis=1)
     faults = []
     for number, part in enumerate(parts):
-        mine = rows_part[second] == number
+        mine = part_of[second] == number
         if not mine.any():
             continue
-        others = np.unique(rows_part[first[mine]])
+        others = np.unique(part_of[first[mine]])
         who = ", ".join("the same file" if o == number else parts[o].path.name for o in others)
         text = f"{part.path}: {mine.sum()} of its frames stand in {who}, too; each was used once"
         differing = second[mine & ~same]

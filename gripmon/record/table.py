@@ -1,141 +1,172 @@
 """The frames of a recording as columns, for the report, the correction and the export.
 
-Needs only NumPy and msgspec; of JSON lines only the fields of the columns are decoded.
+:class:`FrameTable` says once, for each column, where in a record it stands, its unit and its meaning: what is built
+from records here, and what is written as Parquet, follow from it.
 """
+
+# ruff: noqa: RUF009 - what describes a column makes a ``dataclasses.field`` of its own
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.model.records import (
-    Absolute,
-    Drift,
-    FrameRecord,
-    Origin,
-    Protection,
-    Since,
-    SinceReference,
-    Smoothed,
-    State,
-    Transform,
-    ValidBy,
-    Verdict,
-)
+from gripmon.model.records import Absolute, FrameRecord, Origin, Since, Smoothed, State, Transform, ValidBy, Verdict
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
+CodeArray = NDArray[np.int8]
 
 OTHER = "other"
 """Replaces a state or origin that only a newer version knows."""
 _BLOCK_ROWS = 4096
-_Integer = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-_Square = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 
 
-class _Corner(msgspec.Struct, frozen=True, gc=False):
-    used: bool = False
+@dataclass(frozen=True)
+class Column:
+    """``of`` gives a record's value, of this ``type`` and ``shape``; None becomes NaN.  ``names``: it is a code, an
+    index into them.
+    """
+
+    of: Callable[[FrameRecord], Any]
+    unit: str
+    help: str
+    type: type[np.generic] = np.float64
+    shape: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
 
 
-class Line(msgspec.Struct, frozen=True, gc=False):
-    """The fields of a :class:`FrameRecord` that the columns need; those that another version omits are unknown."""
+def _column(unit: str, help_: str, of: Callable[[FrameRecord], Any], *more: Any) -> Any:
+    return dataclasses.field(metadata={"column": Column(of, unit, help_, *more)})
 
-    seq: _Integer
-    stamp_ns: _Integer
-    schema: str = ""
-    verdict: str = Verdict.UNKNOWN.value
-    state: str = OTHER
-    source: str = OTHER
-    cam_T_grip: Transform | None = None
-    covariance: _Square | None = None
-    smoothed: Smoothed | None = None
-    drift: Drift | None = None
-    reference_id: str = ""
-    revision: _Integer = -1
-    rms_px: float | None = None
-    jaw_opening_m: float | None = None
-    corners: tuple[_Corner, ...] = ()
-    alerts: tuple[msgspec.Raw, ...] = ()
-    latency_ns: _Integer = -1
-    reason: str | None = None
-    protection: Protection | None = None
-    valid_by: str = ValidBy.ABSOLUTE.value
-    since_reference: SinceReference | None = None
-    absolute: Absolute | None = None
+
+def _whole(unit: str, help_: str, of: Callable[[FrameRecord], Any]) -> Any:
+    return _column(unit, help_, of, np.int64)
+
+
+def _pose(help_: str, of: Callable[[FrameRecord], Transform | Smoothed | Absolute | None]) -> Any:
+    def numbers(record: FrameRecord) -> tuple[float, ...]:
+        pose = of(record)
+        return _NAN_7 if pose is None else pose.translation_m + pose.rotation_xyzw
+
+    axes = "position of the TCP in camera axes, unit quaternion x, y, z, w"
+    return _column("m", f"{help_}: {axes}", numbers, np.float64, (7,))
+
+
+def _covariance(whose: str, of: Callable[[FrameRecord], tuple[float, ...] | None]) -> Any:
+    axes = "the TCP's position in camera axes, then the rotation vector"
+    return _column("m2, m rad, rad2", f"of {whose}: {axes}", lambda r: of(r) or _NAN_36, np.float64, (6, 6))
+
+
+def _code(help_: str, of: Callable[[FrameRecord], Any], names: tuple[str, ...], unknown: str) -> Any:
+    codes = {name: code for code, name in enumerate(names)}
+
+    def code(record: FrameRecord) -> int:
+        name = of(record)
+        return -1 if name is None else codes.get(name, codes[unknown])
+
+    return _column("", help_, code, np.int8, (), names)
+
+
+_NAN_3, _NAN_7, _NAN_36 = (np.nan,) * 3, (np.nan,) * 7, (np.nan,) * 36
+_VERDICTS = tuple(v.value for v in Verdict)
+_STATES = (*(s.value for s in State), OTHER)
+_ORIGINS = (*(o.value for o in Origin), OTHER)
+_VALID_BY = tuple(v.value for v in ValidBy)
+_SINCE = (*(s.value for s in Since), OTHER)
+_POSITION, _ANGLE = "bound on the TCP's position error", "bound on the angle of the rotation error"
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """One row per frame; NaN where a number is null, -1 where an integer is unknown.
+    """One row per frame; NaN where a number is null, -1 where an integer or a code is unknown.
 
-    Codes index the tuples of names: ``VERDICTS[verdict]``, ``STATES[state]``, ``ORIGINS[source]``,
+    (n,) each, but poses (n, 7), covariances (n, 6, 6), position (m) before rotation vector (rad), and ``tcp_shift_m``
+    (n, 3).  Codes index the tuples of names: ``VERDICTS[verdict]``, ``STATES[state]``, ``ORIGINS[source]``,
     ``VALID_BY[valid_by]``, ``SINCE[since]``, ``reference_ids[reference]``.  A state or origin that this version doesn't
-    know is ``other``; an unknown verdict counts as ``unknown``, on which nothing may rely.
+    know is ``other``.  Metadata of each field: its :class:`Column`.
     """
 
-    VERDICTS: ClassVar[tuple[str, ...]] = tuple(v.value for v in Verdict)
-    STATES: ClassVar[tuple[str, ...]] = (*(s.value for s in State), OTHER)
-    ORIGINS: ClassVar[tuple[str, ...]] = (*(o.value for o in Origin), OTHER)
-    VALID_BY: ClassVar[tuple[str, ...]] = tuple(v.value for v in ValidBy)
-    SINCE: ClassVar[tuple[str, ...]] = (*(s.value for s in Since), OTHER)
+    VERDICTS: ClassVar[tuple[str, ...]] = _VERDICTS
+    STATES: ClassVar[tuple[str, ...]] = _STATES
+    ORIGINS: ClassVar[tuple[str, ...]] = _ORIGINS
+    VALID_BY: ClassVar[tuple[str, ...]] = _VALID_BY
+    SINCE: ClassVar[tuple[str, ...]] = _SINCE
 
-    seq: IntArray
-    """(n,) number of the frame."""
-    stamp_ns: IntArray
-    """(n,) capture time, Unix ns."""
-    verdict: NDArray[np.int8]
-    state: NDArray[np.int8]
-    source: NDArray[np.int8]
-    cam_T_grip: FloatArray
-    """(n, 7) what ``valid_by`` names: x, y, z of the TCP in camera axes, m; unit quaternion x, y, z, w."""
-    covariance: FloatArray
-    """(n, 6, 6): position (m), then rotation vector (rad), camera axes."""
-    smoothed: FloatArray
-    """(n, 7) as ``cam_T_grip``."""
-    smoothed_covariance: FloatArray
-    protection_m: FloatArray
-    """(n,) protection level: bound on the TCP's position error; NaN in recordings from before it was computed, too."""
-    protection_rad: FloatArray
-    """(n,) bound on the angle of the rotation error."""
-    integrity_risk: FloatArray
-    """(n,) probability per frame that the error exceeds a bound."""
-    valid_by: NDArray[np.int8]
-    """(n,) which transform and which error ``cam_T_grip``, ``covariance`` and the protection level are of."""
-    since_reference_m: FloatArray
-    """(n,) bound on the position error of the motion since the reference; NaN in recordings from before it, too."""
-    since_reference_rad: FloatArray
-    since: NDArray[np.int8]
-    """(n,) what that motion counts from; -1: not known."""
-    since_ns: IntArray
-    """(n,) and its stamp, Unix ns."""
-    absolute_m: FloatArray
-    """(n,) bound on the position error of the transform as measured."""
-    absolute_rad: FloatArray
-    absolute: FloatArray
-    """(n, 7) the transform as measured."""
-    d_m: FloatArray
-    """(n,) length of the camera's displacement from the reference."""
-    delta_rad: FloatArray
-    """(n,) its turn."""
-    tcp_shift_m: FloatArray
-    """(n, 3) displacement of the TCP along the camera's axes."""
-    reference: NDArray[np.int32]
-    """(n,) index into ``reference_ids``."""
-    revision: IntArray
-    rms_px: FloatArray
-    jaw_opening_m: FloatArray
-    latency_ns: IntArray
-    corners_used: NDArray[np.int32]
-    corners_total: NDArray[np.int32]
-    refused: NDArray[np.bool_]
-    """(n,) nothing was measured in this frame; its transform, if any, is held."""
+    stamp_ns: IntArray = _whole("ns", "capture time: Unix", lambda r: r.stamp_ns)
+    seq: IntArray = _whole("1", "number of the frame", lambda r: r.seq)
+    verdict: CodeArray = _code("valid, suspect or unknown", lambda r: r.verdict, _VERDICTS, Verdict.UNKNOWN)
+    state: CodeArray = _code("what the monitor was doing", lambda r: r.state, _STATES, OTHER)
+    source: CodeArray = _code("update, recalibration or held", lambda r: r.source, _ORIGINS, OTHER)
+    tcp_shift_m: FloatArray = _column(
+        "m", "displacement of the TCP against the reference",
+        lambda r: _NAN_3 if r.drift is None else r.drift.tcp_shift_m, np.float64, (3,),
+    )  # fmt: skip
+    protection_m: FloatArray = _column(
+        "m", f"protection level: {_POSITION}", lambda r: r.protection and r.protection.position_m
+    )
+    protection_rad: FloatArray = _column("rad", _ANGLE, lambda r: r.protection and r.protection.rotation_rad)
+    integrity_risk: FloatArray = _column(
+        "1", "probability per frame that the error exceeds a bound", lambda r: r.protection and r.protection.risk
+    )
+    valid_by: CodeArray = _code(
+        "which error that is: reference, of the motion since the reference; absolute", lambda r: r.valid_by,
+        _VALID_BY, ValidBy.REFERENCE,
+    )  # fmt: skip
+    since_reference_m: FloatArray = _column(
+        "m", f"{_POSITION} of the motion since the reference",
+        lambda r: r.since_reference and r.since_reference.position_m,
+    )  # fmt: skip
+    since_reference_rad: FloatArray = _column(
+        "rad", "bound on the angle of its rotation error",
+        lambda r: r.since_reference and r.since_reference.rotation_rad,
+    )  # fmt: skip
+    since: CodeArray = _code(
+        "what that motion counts from: reference or first_proved",
+        lambda r: r.since_reference and r.since_reference.since, _SINCE, OTHER,
+    )  # fmt: skip
+    since_ns: IntArray = _whole(
+        "ns", "stamp of the frames that it counts from: Unix",
+        lambda r: -1 if r.since_reference is None else r.since_reference.since_ns,
+    )  # fmt: skip
+    absolute_m: FloatArray = _column(
+        "m", f"{_POSITION} of the transform as measured", lambda r: r.absolute and r.absolute.position_m
+    )
+    absolute_rad: FloatArray = _column(
+        "rad", "bound on the angle of its rotation error", lambda r: r.absolute and r.absolute.rotation_rad
+    )
+    absolute: FloatArray = _pose("the transform as measured", lambda r: r.absolute)
+    d_m: FloatArray = _column(
+        "m", "length of the camera's displacement against the reference", lambda r: r.drift and r.drift.translation_m
+    )
+    delta_rad: FloatArray = _column(
+        "rad", "turn of the camera against the reference", lambda r: r.drift and r.drift.rotation_rad
+    )
+    cam_T_grip: FloatArray = _pose("maps gripper to camera coordinates; what valid_by names", lambda r: r.cam_T_grip)
+    covariance: FloatArray = _covariance("cam_T_grip", lambda r: r.covariance)
+    smoothed: FloatArray = _pose("cam_T_grip averaged over time", lambda r: r.smoothed)
+    smoothed_covariance: FloatArray = _covariance(
+        "smoothed", lambda r: None if r.smoothed is None else r.smoothed.covariance
+    )
+    reference: NDArray[np.int32] = _column(
+        "", "the reference in force, which drift is measured against", lambda r: r.reference_id, np.int32
+    )
+    revision: IntArray = _whole("1", "of the reference", lambda r: r.revision)
+    rms_px: FloatArray = _column("px", "root mean square of the corners' residuals", lambda r: r.rms_px)
+    jaw_opening_m: FloatArray = _column("m", "as the image shows it", lambda r: r.jaw_opening_m)
+    latency_ns: IntArray = _whole(
+        "ns", "from when the frame came to the monitor's machine to judged", lambda r: r.latency_ns
+    )
+    corners_used: NDArray[np.int32] = _column(
+        "1", "corners that the transform rests on", lambda r: sum([c.used for c in r.corners]), np.int32
+    )
+    corners_total: NDArray[np.int32] = _column("1", "corners of the gripper file", lambda r: len(r.corners), np.int32)
+    refused: NDArray[np.bool_] = _column("", "nothing was measured in this frame", lambda r: not r.measured, np.bool_)
     reference_ids: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -143,11 +174,16 @@ class FrameTable:
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameTable:
         """Some rows: indexes, a mask or a slice."""
-        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in (*_COLUMNS, "reference")})
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
     def matrices(self) -> FloatArray:
         """(n, 4, 4) of ``cam_T_grip``; NaN where it is null."""
         return pose_matrices(self.cam_T_grip)
+
+
+COLUMNS: dict[str, Column] = {
+    field.name: field.metadata["column"] for field in dataclasses.fields(FrameTable) if field.metadata
+}
 
 
 def pose_matrices(poses: Any) -> FloatArray:
@@ -163,105 +199,26 @@ def pose_matrices(poses: Any) -> FloatArray:
     return out
 
 
-_VERDICT_CODES = {name: code for code, name in enumerate(FrameTable.VERDICTS)}
-_STATE_CODES = {name: code for code, name in enumerate(FrameTable.STATES)}
-_ORIGIN_CODES = {name: code for code, name in enumerate(FrameTable.ORIGINS)}
-_VALID_BY_CODES = {name: code for code, name in enumerate(FrameTable.VALID_BY)}
-_SINCE_CODES = {name: code for code, name in enumerate(FrameTable.SINCE)}
-_NAN_3, _NAN_7, _NAN_36 = (np.nan,) * 3, (np.nan,) * 7, (np.nan,) * 36
-
-
-class _Column(NamedTuple):
-    """``of`` returns a record's value, of this ``type`` and ``shape``."""
-
-    of: Callable[[Any], Any]
-    type: type[np.generic] = np.float64
-    shape: tuple[int, ...] = ()
-
-
-def _pose(pose: Transform | Smoothed | Absolute | None) -> tuple[float, ...]:
-    return _NAN_7 if pose is None else pose.translation_m + pose.rotation_xyzw
-
-
-def _since(row: FrameRecord | Line) -> int:
-    return -1 if row.since_reference is None else _SINCE_CODES.get(row.since_reference.since, _SINCE_CODES[OTHER])
-
-
-def _bound_of(row: FrameRecord | Line) -> Absolute | Protection | None:
-    """Of the transform as measured; a record of schema 1 has no other."""
-    return row.absolute or (row.protection if row.valid_by == ValidBy.ABSOLUTE else None)
-
-
-def _as_measured(row: FrameRecord | Line) -> Transform | Absolute | None:
-    return row.absolute or (row.cam_T_grip if row.valid_by == ValidBy.ABSOLUTE else None)
-
-
-_COLUMNS: dict[str, _Column] = {
-    "seq": _Column(lambda r: r.seq, np.int64),
-    "stamp_ns": _Column(lambda r: r.stamp_ns, np.int64),
-    "verdict": _Column(lambda r: _VERDICT_CODES.get(r.verdict, _VERDICT_CODES[Verdict.UNKNOWN]), np.int8),
-    "state": _Column(lambda r: _STATE_CODES.get(r.state, _STATE_CODES[OTHER]), np.int8),
-    "source": _Column(lambda r: _ORIGIN_CODES.get(r.source, _ORIGIN_CODES[OTHER]), np.int8),
-    "cam_T_grip": _Column(lambda r: _pose(r.cam_T_grip), shape=(7,)),
-    "covariance": _Column(lambda r: r.covariance or _NAN_36, shape=(6, 6)),
-    "smoothed": _Column(lambda r: _pose(r.smoothed), shape=(7,)),
-    "smoothed_covariance": _Column(lambda r: _NAN_36 if r.smoothed is None else r.smoothed.covariance, shape=(6, 6)),
-    "protection_m": _Column(lambda r: np.nan if r.protection is None else r.protection.position_m),
-    "protection_rad": _Column(lambda r: np.nan if r.protection is None else r.protection.rotation_rad),
-    "integrity_risk": _Column(lambda r: np.nan if r.protection is None else r.protection.risk),
-    # A name that this version doesn't know counts as the bound that promises less.
-    "valid_by": _Column(lambda r: _VALID_BY_CODES.get(r.valid_by, _VALID_BY_CODES[ValidBy.REFERENCE]), np.int8),
-    "since_reference_m": _Column(lambda r: np.nan if r.since_reference is None else r.since_reference.position_m),
-    "since_reference_rad": _Column(lambda r: np.nan if r.since_reference is None else r.since_reference.rotation_rad),
-    "since": _Column(_since, np.int8),
-    "since_ns": _Column(lambda r: -1 if r.since_reference is None else r.since_reference.since_ns, np.int64),
-    "absolute_m": _Column(lambda r: np.nan if (b := _bound_of(r)) is None else b.position_m),
-    "absolute_rad": _Column(lambda r: np.nan if (b := _bound_of(r)) is None else b.rotation_rad),
-    "absolute": _Column(lambda r: _pose(_as_measured(r)), shape=(7,)),
-    "d_m": _Column(lambda r: np.nan if r.drift is None else r.drift.translation_m),
-    "delta_rad": _Column(lambda r: np.nan if r.drift is None else r.drift.rotation_rad),
-    "tcp_shift_m": _Column(lambda r: _NAN_3 if r.drift is None else r.drift.tcp_shift_m, shape=(3,)),
-    "revision": _Column(lambda r: r.revision, np.int64),
-    "rms_px": _Column(lambda r: r.rms_px),
-    "jaw_opening_m": _Column(lambda r: r.jaw_opening_m),
-    "latency_ns": _Column(lambda r: r.latency_ns, np.int64),
-    "corners_used": _Column(lambda r: sum([c.used for c in r.corners]), np.int32),
-    "corners_total": _Column(lambda r: len(r.corners), np.int32),
-    "refused": _Column(lambda r: r.source == Origin.HELD.value or r.cam_T_grip is None, np.bool_),
-}
-"""Every column but ``reference``; None becomes NaN."""
-_REFERENCE = _Column(lambda r: r.reference_id, np.int32)
-
-
 class TableBuilder:
-    """Collects records into columns block by block, so that memory never holds a long list of objects.
-
-    ``unknown_names``: verdicts, states and origins that this version doesn't know.
-    """
+    """Collects records into columns block by block, so that memory never holds a long list of objects."""
 
     def __init__(self) -> None:
-        self._rows: list[FrameRecord | Line] = []
-        self._blocks: dict[str, list[NDArray[Any]]] = {name: [] for name in (*_COLUMNS, "reference")}
+        self._rows: list[FrameRecord] = []
+        self._blocks: dict[str, list[NDArray[Any]]] = {name: [] for name in COLUMNS}
         self._references: dict[str, int] = {}
         self._count = 0
-        self.unknown_names: set[str] = set()
         self.first_seq = np.iinfo(np.int64).max
         self.last_seq = np.iinfo(np.int64).min
 
     def __len__(self) -> int:
         return self._count
 
-    def add(self, record: FrameRecord | Line) -> None:
+    def add(self, record: FrameRecord) -> None:
         """One more row."""
         self._rows.append(record)
         self._count += 1
         self.first_seq, self.last_seq = min(self.first_seq, record.seq), max(self.last_seq, record.seq)
         if len(self._rows) >= _BLOCK_ROWS:
-            self._close_block()
-
-    def close(self) -> None:
-        """Convert the rows so far, so that ``unknown_names`` is complete."""
-        if self._rows:
             self._close_block()
 
     @staticmethod
@@ -271,24 +228,20 @@ class TableBuilder:
         """
         places: dict[str, int] = {}
         for builder in builders:
-            builder.close()
+            builder._close_block()
             new = np.array([places.setdefault(name, len(places)) for name in builder._references], np.int32)
             builder._blocks["reference"] = [new[block] for block in builder._blocks["reference"]]
         columns: dict[str, Any] = {}
-        for name, column in (*_COLUMNS.items(), ("reference", _REFERENCE)):
+        for name, column in COLUMNS.items():
             blocks = [block for builder in builders for block in builder._blocks.pop(name)]
             columns[name] = np.concatenate(blocks) if blocks else np.empty((0, *column.shape), column.type)
         return FrameTable(**columns, reference_ids=tuple(places))
 
     def _close_block(self) -> None:
         rows, self._rows = self._rows, []
-        for name, column in _COLUMNS.items():
-            values = np.array([column.of(row) for row in rows], column.type)
-            self._blocks[name].append(values.reshape(-1, *column.shape))
         places = self._references
-        self._blocks["reference"].append(
-            np.array([places.setdefault(row.reference_id, len(places)) for row in rows], np.int32)
-        )
-        for row in rows:
-            names = (row.verdict, _VERDICT_CODES), (row.state, _STATE_CODES), (row.source, _ORIGIN_CODES)
-            self.unknown_names.update(str(name) for name, codes in names if name not in codes)
+        for name, column in COLUMNS.items() if rows else ():
+            values = [column.of(row) for row in rows]
+            if name == "reference":
+                values = [places.setdefault(value, len(places)) for value in values]
+            self._blocks[name].append(np.array(values, column.type).reshape(-1, *column.shape))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,6 +60,7 @@ class Run:
     recording_id: str = "run-1"
     files: tuple[Path, ...] = (Path("run-0001.rrd"),)
     image_seqs: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    overlay_seqs: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
 
     @property
     def frames(self) -> FrameTable:
@@ -80,6 +82,9 @@ class Run:
             for record in self.records
             for alert in record.alerts
         )
+
+    def prepare(self, seqs: Sequence[int]) -> None:
+        """There are no images."""
 
     def picture(self, seq: int) -> Picture | None:
         return None
