@@ -25,6 +25,7 @@ from support.playback_runs import (
 from support.recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
 
 from gripmon.model.records import FrameRecord, State, to_json
+from gripmon.record import rrd
 from gripmon.record.read import Collection, open_recordings
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
@@ -331,3 +332,18 @@ def test_files_that_do_not_say_what_they_are(tmp_path: Path):
     assert {name: len(r.frames) for name, r in found.items()} == {"x": 6, "y": 2}
     assert found["x"].meta is None and (found["x"].robot, found["x"].camera) == ("unknown", "unknown")
     assert [msgspec.json.decode(to_json(r), type=FrameRecord) for r in found["x"].records()] == records
+
+
+def test_bytes_that_end_the_process_which_reads_them_cost_nothing_else(run: Run):
+    """As rerun's native code ends it on some damaged files: played by a signal, while records and images are read."""
+    (found,) = open_recordings(run.files).recordings
+    seqs = []
+    for again, shot in found.with_shots(found.frames.seq):
+        if again.seq == run.seqs[1][0]:
+            pid = rrd.child_process().pid
+            os.kill(pid, signal.SIGABRT)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+        seqs.append((again.seq, shot is not None))
+    assert seqs == [(r.seq, r.seq in found.images()) for r in run.records]
+    (fault,) = found.faults
+    assert fault.startswith(f"{run.files[1]}: can't be read by its footer (rerun's reader ended with signal 6); its")

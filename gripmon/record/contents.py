@@ -170,21 +170,27 @@ class Contents:
     def again(self, seqs: IntArray, *, images: bool) -> Iterator[FrameRecord | Shot]:
         """The records of some frames again, and their images, in the order of the file."""
         if isinstance(self.source, LineFile):
-            for line in self.source.lines():
-                with contextlib.suppress(ValueError):
-                    yield decoded_record(line)
+            with contextlib.suppress(OSError):
+                for line in self.source.lines():
+                    with contextlib.suppress(ValueError):
+                        yield decoded_record(line)
         for entity, batch in self.rows((RECORD, IMAGE) if images else (RECORD,), seqs):
             yield from records_of(batch) if entity == RECORD else shots_of(batch)
 
     def rows(
         self, entities: Collection[str], seqs: IntArray | None = None, component: str | None = None
     ) -> Iterator[tuple[str, Any]]:
-        """Rows of the file again, by entity; none if it can't be read any more."""
-        if isinstance(self.source, RrdFile):
-            with contextlib.suppress(OSError, UnreadableFileError):
-                for store, entity, batch in self.source.read(entities, seqs, component):
-                    if store == self.store:
-                        yield entity, batch
+        """Rows of the file again, by entity; no more if it is gone, or can't be read any more, which is a fault."""
+        if not isinstance(self.source, RrdFile):
+            return
+        try:
+            for store, entity, batch in self.source.read(entities, seqs, component):
+                if store == self.store:
+                    yield entity, batch
+        except UnreadableFileError as error:
+            self.source.faults.append(str(error))
+        except OSError as error:
+            self.source.faults.append(f"{error.strerror or error}; what was read before was used")
 
 
 class LineFile:
@@ -201,8 +207,8 @@ class LineFile:
             raise UnreadableFileError(error.strerror or str(error)) from None
 
     def lines(self) -> Iterator[bytes]:
-        """Those that aren't empty; none if it can't be read any more."""
-        with contextlib.suppress(OSError), self.path.open("rb") as lines:
+        """Those that aren't empty.  Raises OSError."""
+        with self.path.open("rb") as lines:
             yield from (line for line in lines if line.strip())
 
 

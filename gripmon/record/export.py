@@ -144,7 +144,7 @@ def _arrow(kind: kinds.Type) -> pa.DataType:
 def _described(kind: kinds.Type) -> str:
     """What a type says of itself, in its first line."""
     text: str = getattr(kind, "cls", type(kind)).__doc__ or ""
-    return text.partition("\n")[0]
+    return text.partition("\n")[0].replace("``", "")
 
 
 def _schema(table: str, fields: Iterable[pa.Field]) -> pa.Schema:

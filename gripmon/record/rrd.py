@@ -31,7 +31,10 @@ FRAME = "frame"
 """The timeline of frame numbers."""
 _IDLE_S = 20.0
 _HOME = str(Path(__file__).resolve().parents[2])
-_BOOTSTRAP = "import sys; sys.path.append(sys.argv[1]); from gripmon.record.rrd import serve; serve(int(sys.argv[2]))"
+_BOOTSTRAP = (
+    "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
+    "from gripmon.record.rrd import serve; serve(int(sys.argv[2]))"
+)
 
 
 class UnreadableFileError(ValueError):
@@ -89,17 +92,17 @@ class RrdFile:
         Raises :class:`UnreadableFileError` if there are no recordings in it, OSError if it can't be read any more.
         """
         given = 0
-        try:
-            for rows in self._read(entities, seqs, component):
-                yield rows
-                given += 1
-            return
-        except ReadingError as error:
-            os.close(os.open(self.path, os.O_RDONLY))  # OSError: it is gone
-            if self._repaired:
-                raise UnreadableFileError(f"can't be read ({error})") from None
-            self._repair(error)
-        yield from itertools.islice(self._read(entities, seqs, component), given, None)
+        while True:
+            try:
+                for rows in itertools.islice(self._read(entities, seqs, component), given, None):
+                    yield rows
+                    given += 1
+                return
+            except ReadingError as error:
+                os.close(os.open(self.path, os.O_RDONLY))  # OSError: it is gone
+                if self._repaired:
+                    raise UnreadableFileError(f"can't be read ({error})") from None
+                self._repair(error)
 
     def _read(self, entities: Collection[str], seqs: Any, component: str | None) -> Iterator[Rows]:
         found = _answers(Query(str(self._readable), self._indexed, tuple(entities), seqs, component))
@@ -148,7 +151,7 @@ class RrdFile:
         if damaged:
             self.faults.append(f"has {damaged} damaged message{'s' * (damaged > 1)}, which were left out")
         elif self._indexed:
-            self.faults.append(f"has a footer that can't be used ({error}); its messages were read one by one")
+            self.faults.append(f"can't be read by its footer ({error}); its messages were read one by one")
         if walk.damaged and self._indexed:
             self.faults.append(f"is damaged at byte {walk.end}; the {walk.end / 1e6:.1f} MB before it were used")
         self._indexed, self._repaired = False, True
@@ -184,7 +187,7 @@ class RrdFile:
         return tempfile.TemporaryDirectory(prefix="gripmon-read-", ignore_cleanup_errors=True)
 
 
-class _Child:
+class ChildProcess:
     """The process that reads.  Several passes may be open at a time."""
 
     def __init__(self) -> None:
@@ -201,6 +204,10 @@ class _Child:
         atexit.register(self.close)
         self._lock = threading.Lock()
         self._numbers = itertools.count()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     @property
     def alive(self) -> bool:
@@ -244,21 +251,22 @@ class _WasIdleError(Exception):
     """The child had ended just then."""
 
 
-_children: dict[int, _Child] = {}  # by the process that it is of: a forked one needs its own
+_children: dict[int, ChildProcess] = {}  # by the process that it is of: a forked one needs its own
 
 
 def _answers(query: Query) -> Iterator[Any]:
     """As :func:`_read`, by the child.  Raises :class:`ReadingError`."""
     try:
-        yield from _child().read(query)
+        yield from child_process().read(query)
     except _WasIdleError:
-        yield from _child().read(query)
+        yield from child_process().read(query)
 
 
-def _child() -> _Child:
+def child_process() -> ChildProcess:
+    """The one that reads; a new one if there is none."""
     child = _children.get(os.getpid())
     if child is None or not child.alive:
-        child = _children[os.getpid()] = _Child()
+        child = _children[os.getpid()] = ChildProcess()
     return child
 
 
