@@ -136,7 +136,7 @@ def test_driver_that_was_killed_goes_on_where_it_was(lerobot: tuple[Path, list[T
     process.wait()
     assert len(workers) >= 1 and psutil.wait_procs(workers, 30.0)[1] == []
     (measured,) = out.glob("episodes-*")
-    (measured / ".cut.parquet-0a1b2c3d.tmp").write_bytes(b"PAR1")  # a file that was being written
+    (measured / "0123456789abcdef.tmp").write_bytes(b"PAR1")  # a file that was being written
     found = measure_dataset(folder / "set", out, folder / "lerobot.yaml", workers=1)
     assert 1 <= found.measured <= 3 and found.failed == 0
     assert hashes_of(out / "stretches") == hashes_of(folder / "out" / "stretches")
@@ -247,7 +247,7 @@ def test_full_disk_is_one_line_and_leaves_what_was_measured(tmp_path: Path, monk
         def full(*_: object, **__: object) -> None:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr("gripmon.model.atomic.os.fsync", full)
+        monkeypatch.setattr("gripmon.analyse.dataset.pq.write_table", full)
         with pytest.raises(InputError, match=r"out: .* can't be written \(No space left on device\); what"):
             results.add(second, [Stretch(episode="b", reason="y")])
         monkeypatch.setattr("gripmon.analyse.dataset.ds.write_dataset", full)
@@ -260,9 +260,14 @@ def test_damaged_result_is_named(tmp_path: Path):
     with Results(tmp_path, "f") as results:
         results.add(of_name("a"), [Stretch(episode="a", reason="x")])
         path = results.path(of_name("a"))
-        path.write_bytes(path.read_bytes()[:-9])
+        whole = path.read_bytes()
+        path.write_bytes(whole[:99] + bytes(len(whole) - 107) + whole[-8:])
         with pytest.raises(InputError, match=rf"{path} can't be read .*; delete it, and the next call measures"):
             results.read(of_name("a"))
+        assert of_name("a") in results
+        for left in (whole[:-9], b""):  # as a power cut leaves it
+            path.write_bytes(left)
+            assert of_name("a") not in results
 
 
 def test_engine_that_is_none_is_one_line(tmp_path: Path):

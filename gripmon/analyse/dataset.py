@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import shutil
 import typing
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,6 @@ from gripmon import __version__
 from gripmon.analyse.stretches import Stretch
 from gripmon.analyse.vectors import to_vectors
 from gripmon.io.sources.episodes import Episode, hash_of
-from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, one_line
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Array, Verdict
@@ -93,7 +93,7 @@ class Results:
         except OSError:
             self._lock.close()
             raise InputError(f"{out}: another gripmon dataset writes there; wait for it", "out") from None
-        for leftover in self._folder.glob(".*.tmp"):
+        for leftover in self._folder.glob("*.tmp"):
             leftover.unlink()
 
     def __enter__(self) -> Self:
@@ -107,15 +107,27 @@ class Results:
         return self._folder / f"{hash_of([episode.key, episode.version])}.parquet"
 
     def __contains__(self, episode: Episode) -> bool:
-        return self.path(episode).exists()
+        try:
+            with self.path(episode).open("rb") as file:
+                file.seek(-4, os.SEEK_END)
+                return file.read() == b"PAR1"
+        except OSError:
+            return False  # absent, or of no length after a power cut: measured again
 
     def add(self, episode: Episode, rows: Sequence[Stretch]) -> None:
-        """Store a result, which survives a kill of the process once this has returned."""
-        buffer = pa.BufferOutputStream()
-        # Of a single row, dictionaries, statistics and compression cost more than they save.
-        pq.write_table(table_of(rows), buffer, use_dictionary=False, write_statistics=False, compression="none")
+        """Store a result, which survives a kill of the process once this has returned.  It isn't flushed to the disk:
+        that took 25 ms of the driver on a busy one, and what a power cut truncates is measured again.
+        """
+        path = self.path(episode)
+        fresh = path.with_suffix(".tmp")
         with writing(self._folder):
-            write_atomically(self.path(episode), buffer.getvalue().to_pybytes())
+            try:
+                # Of a single row, dictionaries, statistics and compression cost more than they save.
+                pq.write_table(table_of(rows), fresh, use_dictionary=False, write_statistics=False, compression="none")
+                fresh.rename(path)
+            except OSError:
+                fresh.unlink(missing_ok=True)
+                raise
 
     def read(self, episode: Episode, columns: list[str] | None = None) -> pa.Table:
         """The stored rows of an episode.  Raises :class:`InputError` if its file is damaged."""
@@ -154,16 +166,20 @@ def write_table(
     tolerance_rad: float,
 ) -> pa.Table:
     """Write the table of the ``episodes`` as ``camera=NAME/part-N.parquet``, in the layout of Hive and their order,
-    replacing an earlier one.  Returns it without pictures.  Raises :class:`InputError` if it can't be written.
+    replacing an earlier one.  Returns it without pictures, the last column.  Raises :class:`InputError` if it can't be
+    written.
     """
-    plain = [name for name in SCHEMA.names if name != "picture"]
-    rows = pa.concat_tables(list(results.blocks(episodes, plain)))
+    rows = pa.concat_tables(list(results.blocks(episodes, SCHEMA.names[:-1])))
     numbers = _mountings(rows, level, tolerance_m, tolerance_rad)
+    field = SCHEMA.field("mounting")
+    place = SCHEMA.get_field_index(field.name)
+    rows = rows.set_column(place, field, pa.array(numbers, field.type, mask=numbers < 0))
 
     def batches() -> Iterator[pa.RecordBatch]:
         begin = 0
-        for block in results.blocks(episodes):
-            yield from _with(block, numbers[begin : begin + len(block)]).to_batches()
+        for block in results.blocks(episodes, SCHEMA.names[-1:]):
+            whole = rows.slice(begin, len(block)).append_column(SCHEMA.field(-1), block.column(0))
+            yield from whole.combine_chunks().to_batches()
             begin += len(block)
 
     fresh = out / f".{TABLE}"
@@ -180,13 +196,7 @@ def write_table(
             fresh.rename(out / TABLE)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
-    return _with(rows, numbers)
-
-
-def _with(rows: pa.Table, mountings: NDArray[np.int64]) -> pa.Table:
-    field = SCHEMA.field("mounting")
-    numbers = pa.array(mountings, field.type, mask=mountings < 0)
-    return rows.set_column(rows.schema.get_field_index(field.name), field, numbers)
+    return rows
 
 
 def _mountings(rows: pa.Table, level: float, tolerance_m: float, tolerance_rad: float) -> NDArray[np.int64]:

@@ -145,7 +145,8 @@ def on_ray(
         while waiting or flying:
             most = _RAY_AHEAD * max(int(resources().get("CPU", 1)), 1)
             while waiting and len(flying) < most:
-                flying[task.remote(shared, waiting[0], lens)] = waiting.popleft()
+                episode = waiting.popleft()
+                flying[task.remote(shared, episode, lens)] = episode
             for done in ray.wait(list(flying), num_returns=1)[0]:
                 episode = flying.pop(done)
                 try:
