@@ -21,16 +21,14 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from gripmon import __version__
-from gripmon.analyse.stretches import Stretch
+from gripmon.analyse.stretches import POSE_COLUMNS, Stretch
 from gripmon.analyse.vectors import to_vectors
 from gripmon.io.sources.episodes import Episode, hash_of
 from gripmon.model.errors import InputError, one_line
-from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Array, Verdict
 from gripmon.record.table import pose_matrices
 
 TABLE, REPORT = "stretches", "report.html"
-POSE_COLUMNS = [f"cam_T_grip_{name}" for name in POSE_NAMES]
 _GROUP_ROWS, _FILE_ROWS = 1000, 50_000
 """Rows in memory at a time (with pictures about 20 MB), and per file."""
 _SMALL = ("stretch", "mounting", "frames")

@@ -14,8 +14,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from gripmon.analyse.content import count
-from gripmon.analyse.dataset import POSE_COLUMNS, Results, writing
+from gripmon.analyse.dataset import Results, writing
 from gripmon.analyse.page import rendered
+from gripmon.analyse.stretches import POSE_COLUMNS
 from gripmon.io.sources.episodes import Episode
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
@@ -109,7 +110,7 @@ def _mounting(rows: pa.Table, camera: str, number: int, places: Sequence[int]) -
 
 def _tcp_m(rows: pa.Table, places: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:
     """(n, 3) of some rows."""
-    some = rows.select(POSE_COLUMNS[:3]).take(places)
+    some = rows.select(list(POSE_COLUMNS[:3])).take(places)
     return np.column_stack([column.to_numpy() for column in some.columns])
 
 

@@ -26,7 +26,13 @@ from gripmon.model.units import in_mm
 from gripmon.record.table import FrameTable, pose_matrices
 
 _NUMBER = re.compile(r"\d[\d.e+-]*")
+POSE_COLUMNS = tuple(f"cam_T_grip_{name}" for name in POSE_NAMES)
 Bools = NDArray[np.bool_]
+Number = float | None
+Integer = int | None
+Text = str | None
+Numbers = tuple[float, ...] | None
+Runs = tuple[tuple[int, int], ...] | None
 
 
 def _is(text: str, *columns: str) -> Meta:
@@ -43,67 +49,39 @@ class Stretch(msgspec.Struct, frozen=True, kw_only=True):
     episode: Annotated[str, _is("path below the dataset; of LeRobot with # and its number")] = ""
     stretch: Annotated[int, _is("0, 1, … in order of time; each motion begins another")] = 0
     verdict: Annotated[str, _is("valid: use the transform; suspect, unknown: don't")] = Verdict.UNKNOWN.value
-    mounting: Annotated[
-        int | None, _is("what has the same number (and camera) shares a mounting; null: not known")
-    ] = None
-    start_ns: Annotated[int | None, _is("first frame's stamp (ns; of LeRobot from the episode's beginning)")] = None
-    end_ns: Annotated[int | None, _is("last frame's stamp (ns)")] = None
+    mounting: Annotated[Integer, _is("what has the same number (and camera) shares a mounting; null: not known")] = None
+    start_ns: Annotated[Integer, _is("first frame's stamp (ns; of LeRobot from the episode's beginning)")] = None
+    end_ns: Annotated[Integer, _is("last frame's stamp (ns)")] = None
     frames: Annotated[int, _is("in the stretch")] = 0
-    measured_share: Annotated[float | None, _is("of its frames with a transform of their own, 0 to 1")] = None
-    valid_share: Annotated[float | None, _is("of its frames whose transform was valid, 0 to 1")] = None
-    cam_T_grip: Annotated[
-        tuple[float, ...] | None,
-        _is(
-            "maps gripper to camera coordinates, as measured; null: not measured",
-            *(f"cam_T_grip_{name}" for name in POSE_NAMES),
-        ),
-    ] = None
-    covariance: Annotated[
-        tuple[float, ...] | None,
-        _is("6 x 6 by rows, position (m) then rotation (rad), camera axes; a single frame's, not a mean's"),
-    ] = None
-    valid_by: Annotated[
-        str | None, _is("which error protection bounds: absolute; reference: without what is the same since since_ns")
-    ] = None
-    protection_m: Annotated[
-        float | None, _is("bound on the position error in each valid frame of the stretch, as valid_by; null: none")
-    ] = None
-    protection_rad: Annotated[float | None, _is("bound on the rotation error, as valid_by")] = None
-    integrity_risk: Annotated[float | None, _is("probability per frame that the error exceeds a bound")] = None
-    since_reference_m: Annotated[float | None, _is("bound on the position error of the motion since since_ns")] = None
-    since_reference_rad: Annotated[float | None, _is("bound on its rotation error")] = None
-    since: Annotated[
-        str | None,
-        _is("what that motion counts from, in this episode: reference, frames of a recalibration; first_proved"),
-    ] = None
-    since_ns: Annotated[int | None, _is("stamp of these frames; null: not known")] = None
-    absolute_m: Annotated[
-        float | None, _is("bound on the position error with all that is the same in every episode")
-    ] = None
-    absolute_rad: Annotated[float | None, _is("bound on the rotation error, likewise")] = None
+    measured_share: Annotated[Number, _is("of its frames with a transform of their own, 0 to 1")] = None
+    valid_share: Annotated[Number, _is("of its frames whose transform was valid, 0 to 1")] = None
+    cam_T_grip: Annotated[Numbers, _is("gripper to camera coordinates, as measured; null: none", *POSE_COLUMNS)] = None
+    covariance: Annotated[Numbers, _is("6 x 6 by rows, position (m) then rotation (rad), camera axes")] = None
+    valid_by: Annotated[Text, _is("which error protection bounds: absolute; reference, of the motion since it")] = None
+    protection_m: Annotated[Number, _is("bound on the position error in each valid frame of it; null: none")] = None
+    protection_rad: Annotated[Number, _is("bound on the rotation error")] = None
+    integrity_risk: Annotated[Number, _is("probability per frame that the error exceeds a bound")] = None
+    since_reference_m: Annotated[Number, _is("bound on the position error of the motion since since_ns")] = None
+    since_reference_rad: Annotated[Number, _is("bound on its rotation error")] = None
+    since: Annotated[Text, _is("what that counts from, in this episode: reference, or first_proved frames")] = None
+    since_ns: Annotated[Integer, _is("stamp of these frames; null: not known")] = None
+    absolute_m: Annotated[Number, _is("bound on the position error with what is wrong in every episode alike")] = None
+    absolute_rad: Annotated[Number, _is("bound on the rotation error, likewise")] = None
     moved: Annotated[bool | None, _is("the camera moved within this episode, at once or slowly")] = None
-    crept_m: Annotated[
-        float | None, _is("from the stretch's first half to its second, on average; null: not beyond chance")
-    ] = None
-    not_valid_ns: Annotated[
-        tuple[tuple[int, int], ...] | None, _is("first and last stamp of each run of frames in which it isn't valid")
-    ] = None
-    motion_ns: Annotated[int | None, _is("when the camera moved, before this stretch; null: it is the first")] = None
-    motion_earliest_ns: Annotated[int | None, _is("it had not moved by then, in 95 of 100 cases")] = None
-    motion_latest_ns: Annotated[int | None, _is("it had moved by then")] = None
-    motion_m: Annotated[float | None, _is("how far the TCP moved")] = None
-    motion_xyz_m: Annotated[
-        tuple[float, ...] | None, _is("along the camera's axes", "motion_x_m", "motion_y_m", "motion_z_m")
-    ] = None
-    motion_rad: Annotated[float | None, _is("its turn")] = None
-    motion_p_value: Annotated[float | None, _is("probability of as large a difference by chance")] = None
-    motion_cause: Annotated[
-        str | None, _is("most probable cause by the alerts; unknown: none is probable enough")
-    ] = None
+    crept_m: Annotated[Number, _is("from its first half to its second, on average; null: not beyond chance")] = None
+    not_valid_ns: Annotated[Runs, _is("first and last stamp of each run of frames in which it isn't valid")] = None
+    motion_ns: Annotated[Integer, _is("when the camera moved, before this stretch; null: it is the first")] = None
+    motion_earliest_ns: Annotated[Integer, _is("it had not moved by then, in 95 of 100 cases")] = None
+    motion_latest_ns: Annotated[Integer, _is("it had moved by then")] = None
+    motion_m: Annotated[Number, _is("how far the TCP moved")] = None
+    motion_xyz_m: Annotated[Numbers, _is("along the camera's axes", *(f"motion_{axis}_m" for axis in "xyz"))] = None
+    motion_rad: Annotated[Number, _is("its turn")] = None
+    motion_p_value: Annotated[Number, _is("probability of as large a difference by chance")] = None
+    motion_cause: Annotated[Text, _is("most probable cause by the alerts; unknown: none is probable enough")] = None
     own_reference: Annotated[bool, _is("recalibrated from this episode; false: against the configuration's")] = False
     lens: Annotated[str, _is("whose camera calibration: file or configuration")] = "configuration"
-    gripper: Annotated[str | None, _is("gripper file by which it was measured; null: none")] = None
-    reason: Annotated[str | None, _is("why there is no transform, or why frames weren't valid")] = None
+    gripper: Annotated[Text, _is("gripper file by which it was measured; null: none")] = None
+    reason: Annotated[Text, _is("why there is no transform, or why frames weren't valid")] = None
     picture: Annotated[bytes | None, _is("JPEG with what was measured; null: none")] = None
 
 
@@ -243,12 +221,9 @@ class _Episode:
         since = np.column_stack([table.since_reference_m[rows], table.since_reference_rad[rows]]) + way
         absolute = np.column_stack([table.absolute_m[rows], table.absolute_rad[rows]]) + way
         published = self.bounds[rows] + _lengths(mean, self.named[rows])
-        names = ("protection", published), ("since_reference", since), ("absolute", absolute)
-        known = {
-            f"{name}_{unit}": _largest(values[:, k])
-            for name, values in names
-            for k, unit in enumerate(("m", "rad"))
-        }
+        bounds = {"protection": published, "since_reference": since, "absolute": absolute}
+        known = {f"{name}_m": _largest(values[:, 0]) for name, values in bounds.items()}
+        known |= {f"{name}_rad": _largest(values[:, 1]) for name, values in bounds.items()}
         since_code, since_ns = int(table.since[rows[-1]]), int(table.since_ns[rows[-1]])
         return known | {
             "integrity_risk": _largest(table.integrity_risk[rows]),

@@ -10,8 +10,9 @@ from pathlib import Path
 import msgspec
 
 from gripmon import __version__
-from gripmon.analyse.dataset import POSE_COLUMNS, REPORT, TABLE, Results, write_table
+from gripmon.analyse.dataset import REPORT, TABLE, Results, write_table
 from gripmon.analyse.dataset_page import write_page
+from gripmon.analyse.stretches import POSE_COLUMNS
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.dataset.engines import ENGINES, local, on_ray
 from gripmon.daemon.replaying import as_configured
