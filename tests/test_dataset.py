@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import os
 import re
 import subprocess
 import sys
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,15 +18,13 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 from support import dataset_scenes
-from support.dataset_scenes import FPS, MOTION_M, OF_BAGS, Truth, make_bags, make_lerobot, write_config
+from support.dataset_scenes import FPS, MOTION_M, OF_BAGS, Truth, make_lerobot, write_config
 from support.episode_files import WRIST, Shots, write_lerobot, write_mcap
 
 from gripmon.analyse.dataset import Results, write_table
 from gripmon.analyse.stretches import Stretch
 from gripmon.cli import main
-from gripmon.daemon.config import Config, builtin_config, load_config
-from gripmon.daemon.dataset import engines, measure_dataset, measuring
-from gripmon.daemon.dataset.engines import DIED, local
+from gripmon.daemon.dataset import measure_dataset, measuring
 from gripmon.daemon.dataset.measuring import measure
 from gripmon.io.sources import BagSettings, SourceError
 from gripmon.io.sources.episodes import Episode, find_episodes
@@ -154,37 +149,6 @@ def of_name(name: str) -> Episode:
     return Episode(name, BagSettings(path="x"), "")
 
 
-def die_of_the_second(_config: Config, episode: Episode, _lens: str) -> tuple[Stretch, ...]:
-    if episode.name == "1":
-        os._exit(9)
-    return (Stretch(episode=episode.name, camera=str(os.getpid())),)
-
-
-def test_episode_that_kills_its_worker_is_a_row_and_the_others_are_measured(monkeypatch: pytest.MonkeyPatch):
-    """Workers are also replaced, after two episodes here, before what stays with them adds up."""
-    monkeypatch.setattr(engines, "WORKER_EPISODES", 2)
-    config = load_config(builtin_config("demo.yaml"), check_source=False)
-    found = {
-        episode.name: rows[0]
-        for episode, rows in local(config, [of_name(str(i)) for i in range(5)], "file", 1, die_of_the_second)
-    }
-    assert {name: row.reason for name, row in found.items()} == dict.fromkeys("0234") | {"1": DIED}
-    assert sorted(Counter(row.camera for name, row in found.items() if name != "1").values()) == [1, 1, 2]
-
-
-class CannotBegin:
-    """Work that no other process can read."""
-
-    def __reduce__(self) -> tuple[Callable[[int], None], tuple[int]]:
-        return os._exit, (7,)
-
-
-def test_process_that_cannot_begin_is_one_line_and_no_row():
-    config = load_config(builtin_config("demo.yaml"), check_source=False)
-    with pytest.raises(InputError, match=r"engine: a process can't begin \(exit code 7\)"):
-        list(local(config, [of_name("a")], "file", 1, CannotBegin()))  # type: ignore[arg-type]
-
-
 BLANK = Shots([np.full((288, 384), 90, np.uint8)] * 6, [i * NS for i in range(1, 7)], [0.03] * 6)
 OTHER = Shots([np.full((48, 64), 90, np.uint8)] * 6, [i * NS for i in range(1, 7)], [0.03] * 6)
 CHANGING = Shots([*BLANK.images[:3], *OTHER.images[:3]], BLANK.stamps_ns, BLANK.openings_m)
@@ -270,12 +234,6 @@ def test_damaged_result_is_named(tmp_path: Path):
             assert of_name("a") not in results
 
 
-def test_engine_that_is_none_is_one_line(tmp_path: Path):
-    with pytest.raises(InputError, match="engine: 'dask' is none; local or ray"):
-        measure_dataset(tmp_path, tmp_path / "out", "c.yaml", engine="dask")
-    assert not (tmp_path / "out").exists()
-
-
 def test_every_kind_of_episode_is_found(tmp_path: Path):
     import cv2
 
@@ -329,49 +287,3 @@ def test_a_mounting_beyond_the_references_sigma_is_measured_too(tmp_path: Path, 
     (row,) = measure(config, Episode("a", source, ""))
     assert row.own_reference and row.verdict == "valid" and row.cam_T_grip is not None
     assert np.linalg.norm(np.subtract(row.cam_T_grip[:3], truth.first_T[:3, 3])) < row.protection_m
-
-
-PLAN = [(i * 3 // 24, i in (5, 17)) for i in range(24)]
-PLAN_OF_BAGS = [(i % 3, False) for i in range(16)]
-
-
-@pytest.mark.slow("some five minutes: forty episodes, Ray; four episodes and the local engine are tested above")
-def test_forty_episodes_here_and_on_a_cluster_with_a_kill(tmp_path: Path):
-    """A LeRobot dataset and a folder of MCAPs, three mountings, two episodes in which the camera moves."""
-    ray = pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    config, truths = make_lerobot(tmp_path, PLAN)
-    config_of_bags, truths_of_bags = make_bags(tmp_path, PLAN_OF_BAGS)
-    measure_dataset(tmp_path / "set", tmp_path / "out", config)
-    measure_dataset(tmp_path / "bags", tmp_path / "out_of_bags", config_of_bags)
-    assert_true(rows_of(tmp_path / "out"), truths, lambda _: 0.0)
-    assert_true(rows_of(tmp_path / "out_of_bags"), truths_of_bags, lambda row: 1e-9 * row["start_ns"])
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    try:
-        cluster.add_node(num_cpus=1)
-        killer = threading.Thread(target=kill_one_worker, daemon=True)
-        killer.start()
-        found = measure_dataset(tmp_path / "set", tmp_path / "on_ray", config, engine="ray", address=cluster.address)
-        killer.join(10.0)
-        assert not killer.is_alive(), "a worker was killed"
-        assert (found.measured, found.failed) == (24, 0)
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
-    assert hashes_of(tmp_path / "on_ray" / "stretches") == hashes_of(tmp_path / "out" / "stretches")
-
-
-def kill_one_worker() -> None:
-    """A process of this test's cluster that measures an episode."""
-    me = psutil.Process()
-    while True:
-        for process in me.children(recursive=True):
-            try:
-                if process.cmdline()[0].startswith("ray::_on_ray"):
-                    time.sleep(1.0)
-                    process.kill()
-                    return
-            except (psutil.Error, IndexError):
-                continue
-        time.sleep(0.1)

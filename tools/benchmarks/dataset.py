@@ -223,7 +223,7 @@ def _driver_end(folder: Path, rows: int) -> dict[str, float]:
             row = Stretch(
                 camera="wrist", episode=episode.name, verdict="valid", start_ns=0, end_ns=10, frames=300,
                 measured_share=1.0, valid_share=1.0, cam_T_grip=place, covariance=covariance, protection_m=5e-4,
-                moved=False, not_valid_ns=((0, 0),), picture=rng.bytes(12_000), reason="1 times: not yet confirmed",
+                moved=False, not_valid_ns=((0, 0),), picture=rng.bytes(19_000), reason="1 times: not yet confirmed",
             )  # fmt: skip
             results.add(episode, (row,))
         stored_s = time.process_time()

@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -46,7 +46,9 @@ class _Worker:
         self.began, self.measured = False, 0
 
     def end(self) -> None:
+        """End the process, whatever it does, and wait until it has ended."""
         self.process.terminate()
+        self.process.join()
         self.connection.close()
 
 
@@ -64,7 +66,7 @@ def _serve(connection: Connection, config: Config, lens: str, work: Measuring) -
 
 def local(
     config: Config, episodes: Sequence[Episode], lens: str, workers: int, work: Measuring = measure
-) -> Iterator[tuple[Episode, Rows]]:
+) -> Generator[tuple[Episode, Rows], None, None]:
     """Measure in ``workers`` processes, each replaced after :data:`WORKER_EPISODES`; an episode that kills
     :data:`TRIES` of them is given up.  Raises :class:`InputError` if a process can't even begin.
     """
@@ -89,7 +91,7 @@ def local(
                 try:
                     rows: Rows | None = worker.connection.recv()
                 except (EOFError, OSError):
-                    worker.process.join()
+                    worker.end()
                     if not worker.began:
                         text = f"a process can't begin (exit code {worker.process.exitcode}); what it wrote is above"
                         raise InputError(text, "engine") from None
@@ -112,17 +114,18 @@ def local(
     finally:
         for worker in (*idle, *(each for each, _ in busy.values())):
             worker.end()
-            worker.process.join()
 
 
 def on_ray(
     config: Config, episodes: Sequence[Episode], lens: str, address: str | None
-) -> Iterator[tuple[Episode, Rows]]:
+) -> Generator[tuple[Episode, Rows], None, None]:
     """Measure on the Ray cluster at ``address`` (None: the one that Ray finds, or this machine), on as many nodes as it
     has at a time.  Ray retries an episode whose worker died; one that kills :data:`_RAY_TRIES` is given up.
 
     Raises :class:`InputError` without Ray, if no cluster answers, and if it is lost or can't run tasks.
     """
+    if not episodes:
+        return
     try:
         import ray
         from ray.exceptions import OutOfMemoryError, RayError, WorkerCrashedError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -62,6 +63,8 @@ def measure_dataset(
     """
     if engine not in ENGINES:
         raise InputError(f"{engine!r} is none; {' or '.join(ENGINES)}", "engine")
+    if workers is not None and workers < 1:
+        raise InputError(f"{workers} isn't a number of processes; 1 or more", "workers")
     config = config if isinstance(config, Config) else load_config(config, check_source=False)
     episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
     folder = writable_folder(Path(out))
@@ -70,12 +73,13 @@ def measure_dataset(
         for _ in range(len(episodes) - len(left)):
             step(len(episodes))
         if engine == "ray":
-            measured = on_ray(config, left, lens, address) if left else iter(())
+            measured = on_ray(config, left, lens, address)
         else:
             measured = local(config, left, lens, workers or len(os.sched_getaffinity(0)))
-        for episode, rows in measured:
-            results.add(episode, rows)
-            step(len(episodes))
+        with contextlib.closing(measured):
+            for episode, rows in measured:
+                results.add(episode, rows)
+                step(len(episodes))
         table = write_table(results, episodes, folder, level, tolerance_m, tolerance_rad)
         write_page(folder / REPORT, table, results, episodes, str(dataset))
     known = table.filter(table[POSE_COLUMNS[0]].is_valid()).group_by(["episode", "camera"]).aggregate([])
