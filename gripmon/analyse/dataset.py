@@ -9,7 +9,7 @@ import shutil
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import NoneType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from gripmon import __version__
-from gripmon.analyse.stretches import POSE_COLUMNS, Stretch
+from gripmon.analyse.stretches import POSE_COLUMNS, Numbers, Runs, Stretch
 from gripmon.analyse.vectors import to_vectors
 from gripmon.io.sources.episodes import Episode, hash_of
 from gripmon.model.errors import InputError, one_line
@@ -32,15 +32,10 @@ TABLE, REPORT = "stretches", "report.html"
 _GROUP_ROWS, _FILE_ROWS = 1000, 50_000
 """Rows in memory at a time (with pictures about 20 MB), and per file."""
 _SMALL = ("stretch", "mounting", "frames")
-_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_(), bytes: pa.binary()}
-
-
-def _type(hint: Any) -> pa.DataType:
-    """``int | None``: int64; ``tuple[float, ...]``: list of doubles."""
-    parts = typing.get_args(hint)
-    if NoneType in parts:
-        return _type(next(part for part in parts if part is not NoneType))
-    return _TYPES[hint] if hint in _TYPES else pa.list_(_type(parts[0]))
+_TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+_TYPES |= {bytes: pa.binary()}
+_TYPES |= {kind | None: type_ for kind, type_ in _TYPES.items()}
+_TYPES |= {Numbers: pa.list_(pa.float64()), Runs: pa.list_(pa.list_(pa.int64()))}
 
 
 def _fields() -> Iterator[tuple[str, tuple[str, ...], pa.Field]]:
@@ -49,7 +44,7 @@ def _fields() -> Iterator[tuple[str, tuple[str, ...], pa.Field]]:
         kind, about = typing.get_args(hint)
         spread = about.extra["columns"]
         for column in spread or (name,):
-            type_ = pa.float64() if spread else pa.int32() if name in _SMALL else _type(kind)
+            type_ = pa.float64() if spread else pa.int32() if name in _SMALL else _TYPES[kind]
             yield name, spread, pa.field(column, type_, metadata={"description": about.description})
 
 

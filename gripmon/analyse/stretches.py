@@ -6,7 +6,6 @@ import dataclasses
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import msgspec
@@ -99,7 +98,7 @@ def stretches_of(
     was before them.  The bound that ``valid_by`` names is widened by how far each frame's published transform is from
     the stretch's, so that it holds for that.
     """
-    episode = _Episode.of(table, alerts, reasons, policy)
+    episode = _Episode(table, alerts, reasons, policy)
     begins, motions = [0], [dict[str, Any]()]
     ends = [*(point.index for point in episode.change_points[1:]), len(table)]
     for point, end in zip(episode.change_points, ends, strict=False):  # without a change point there is one end more
@@ -114,42 +113,25 @@ def stretches_of(
     return [msgspec.structs.replace(row, moved=moved) for row in rows]
 
 
-@dataclass(frozen=True)
 class _Episode:
     """``poses`` (n, 4, 4): as measured; ``named`` (n, 4, 4): what ``valid_by`` names, which ``bounds`` (n, 2), m and
-    rad, are about; ``smooth`` (n, 4, 4) with ``smooth_covariance``: the smoother's.
+    rad, are about; ``measured``, ``valid`` (n,): which frames are.
     """
 
-    table: FrameTable
-    alerts: Sequence[tuple[int, Alert]]
-    reasons: Sequence[str | None]
-    policy: PolicySettings
-    poses: Array
-    named: Array
-    bounds: Array
-    measured: Bools
-    valid: Bools
-    change_points: tuple[ChangePoint, ...]
-    smooth: Array
-    smooth_covariance: Array
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         table: FrameTable,
         alerts: Sequence[tuple[int, Alert]],
         reasons: Sequence[str | None],
         policy: PolicySettings,
-    ) -> _Episode:
-        smoothed = correct_table(dataclasses.replace(table, cam_T_grip=table.absolute), lambda: None)
-        measured = ~table.refused & np.isfinite(table.absolute).all(axis=1)
-        return cls(
-            table, alerts, reasons, policy, pose_matrices(table.absolute), table.matrices(),
-            np.column_stack([table.protection_m, table.protection_rad]), measured,
-            measured & (table.verdict == table.VERDICTS.index(Verdict.VALID.value)),
-            tuple(sorted(smoothed.change_points, key=lambda point: point.index)), smoothed.cam_T_grip,
-            smoothed.covariance,
-        )  # fmt: skip
+    ) -> None:
+        self.table, self.alerts, self.reasons, self.policy = table, alerts, reasons, policy
+        self.smoothed = correct_table(dataclasses.replace(table, cam_T_grip=table.absolute), lambda: None)
+        self.change_points = sorted(self.smoothed.change_points, key=lambda point: point.index)
+        self.poses, self.named = pose_matrices(table.absolute), table.matrices()
+        self.bounds = np.column_stack([table.protection_m, table.protection_rad])
+        self.measured: Bools = ~table.refused & np.isfinite(table.absolute).all(axis=1)
+        self.valid: Bools = self.measured & (table.verdict == table.VERDICTS.index(Verdict.VALID.value))
 
     def used(self, part: slice) -> NDArray[np.intp]:
         """The frames from which a transform is averaged: the valid ones, or if there are none all measured ones."""
@@ -188,7 +170,8 @@ class _Episode:
         holds = np.zeros(len(table), dtype=bool)
         if len(used):
             mean, covariance = mean_of_one_scene(list(self.poses[used]), list(table.covariance[used]))
-            crept = _compared(self.smooth, self.smooth_covariance, used[: (len(used) + 1) // 2], used[len(used) // 2 :])
+            halves = used[: (len(used) + 1) // 2], used[len(used) // 2 :]
+            crept = _compared(self.smoothed.cam_T_grip, self.smoothed.covariance, *halves)
             moved = crept.p_value < CHANCE
             bounds = self.bounds[used] + _lengths(mean, self.named[used])
             within = (bounds <= [self.policy.alert_limit_m, self.policy.alert_limit_rad]).all(axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
@@ -14,7 +14,7 @@ from gripmon.daemon.api import Monitor
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.checks import view_fault
 from gripmon.daemon.overlay import outlines_of, overlay
-from gripmon.io.sources import FolderSettings, Source, SourceError, VideoSettings, open_source
+from gripmon.io.sources import FolderSettings, OpenedSource, Source, SourceError, VideoSettings, open_source
 from gripmon.io.sources.episodes import Episode
 from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.references import CommandRefused
@@ -33,7 +33,7 @@ from gripmon.model.records import (
 from gripmon.record.table import FrameTable, TableBuilder
 
 PICTURE_WIDTH_PX = 320
-"""Width of thumbnails of about 8 kB, in which fingertips are recognisable; 390,000 take 3 GB."""
+"""Width of thumbnails of about 18 kB, in which fingertips are recognisable; 390,000 take 7 GB."""
 
 Pictured = tuple[Image, FrameRecord]
 Rows = tuple[Stretch, ...]
@@ -76,13 +76,15 @@ def _measured(config: Config, episode: Episode, lens: str) -> Rows:
         config = dataclasses.replace(config, settings=settings, camera=make_camera(from_file))
         if (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
             raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
-    run, coming, own = _Run(config), _frames(source), False
-    renewed = run.until_renewed(coming)
-    if renewed is not None:
-        anew = _Run(dataclasses.replace(config, reference=renewed)).whole(_frames(open_source(episode.source)))
-        own = anew.began_at_reference
-        run = anew if own else run.whole(coming)  # a reference of after a motion doesn't fit what was before
-    source.close()
+    run, own = _Run(config), False
+    with OpenedSource(source) as frames:
+        coming = iter(frames)
+        renewed = run.until_renewed(coming)
+        if renewed is not None:
+            with OpenedSource(open_source(episode.source)) as again:
+                anew = _Run(dataclasses.replace(config, reference=renewed)).whole(again)
+            own = anew.began_at_reference
+            run = anew if own else run.whole(coming)  # a reference of after a motion doesn't fit what was before
     table = run.table()
     plain: dict[str, Any] = {
         "episode": episode.name, "camera": camera, "own_reference": own, "gripper": config.gripper_path.stem,
@@ -96,14 +98,6 @@ def _measured(config: Config, episode: Episode, lens: str) -> Rows:
         return (Stretch(**plain, frames=len(table), reason=reason),)
     shown = run.pictures(len(rows))
     return tuple(msgspec.structs.replace(row, **plain, picture=shown.get(row.stretch)) for row in rows)
-
-
-def _frames(source: Source) -> Iterator[Frame]:
-    try:
-        while isinstance(frame := source.read(), Frame):
-            yield frame
-    finally:
-        source.close()
 
 
 class _Run:
@@ -136,7 +130,7 @@ class _Run:
                 return self._monitor.reference
         return None
 
-    def whole(self, frames: Iterator[Frame]) -> _Run:
+    def whole(self, frames: Iterable[Frame]) -> _Run:
         """The run after all of ``frames``."""
         for frame in frames:
             self.process(frame)
