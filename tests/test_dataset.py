@@ -220,6 +220,22 @@ def test_full_disk_is_one_line_and_leaves_what_was_measured(tmp_path: Path, monk
     assert hashes_of(tmp_path) == before
 
 
+def test_damaged_tables_of_lerobot_are_one_line_or_rows(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """The table of frames costs its episodes, that of episodes the dataset, of which nothing is written then."""
+    write_config(tmp_path / "c.yaml", dataset_scenes.OF_LEROBOT)
+    for name, damaged in (("frames", "data"), ("episodes", "meta")):
+        write_lerobot(tmp_path / name, [BLANK], fps=10, codec="libx264")
+        (table,) = (tmp_path / name / damaged).rglob("*.parquet")
+        table.write_bytes(table.read_bytes()[:-30])
+        command = ["dataset", str(tmp_path / name), "--config", str(tmp_path / "c.yaml"), "--workers", "1"]
+        code = main([*command, "--out", str(tmp_path / f"{name}_out")])
+        assert code == (3 if damaged == "data" else 2)
+    (row,) = rows_of(tmp_path / "frames_out")
+    assert re.search(r"file-000\.parquet can't be read .*; a whole table", row["reason"])
+    said = capfd.readouterr().err.splitlines()[-1]
+    assert "episodes isn't a LeRobot dataset" in said and not (tmp_path / "episodes_out").exists()
+
+
 def test_damaged_result_is_named(tmp_path: Path):
     with Results(tmp_path, "f") as results:
         results.add(of_name("a"), [Stretch(episode="a", reason="x")])
