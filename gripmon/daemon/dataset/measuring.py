@@ -20,6 +20,7 @@ from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.references import CommandRefused
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import in_short
+from gripmon.model.geometry import from_record
 from gripmon.model.records import (
     Alert,
     Command,
@@ -153,8 +154,10 @@ class _Run:
     def pictures(self, stretches: int) -> dict[int, bytes]:
         """JPEGs by number of the stretch: the first valid frame and, if the camera moved, the last."""
         shown = {0: self._first} | ({stretches - 1: self._last} if stretches > 1 else {})
-        config = self._config
-        return {
-            number: overlay(image, record, outlines_of(config.camera, config.gripper, record), PICTURE_WIDTH_PX)
-            for number, (image, record) in ((n, each) for n, each in shown.items() if each is not None)
-        }
+        return {number: self._drawn(*each) for number, each in shown.items() if each is not None}
+
+    def _drawn(self, image: Image, record: FrameRecord) -> bytes:
+        assert record.measured_T is not None, "a valid frame has a transform"
+        cam_T_grip, opening_m = from_record(record.measured_T), record.jaw_opening_m
+        outlines = outlines_of(self._config.camera, self._config.gripper, cam_T_grip, opening_m)
+        return overlay(image, record, outlines, PICTURE_WIDTH_PX)
