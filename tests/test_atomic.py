@@ -17,7 +17,7 @@ OTHERWISE = {
     "io/wire/certificates.py",  # keys, which nobody else may read for a moment
     "daemon/estimates.py",  # lines, as they come
     "cli/alert_log.py",
-    "analyse/dataset.py",
+    "analyse/dataset.py",  # a temporary file that is renamed, and one that is only locked
     "daemon/starting.py",  # whether lines can be written there
     "cli/replay.py",
     "cli/common.py",
@@ -29,7 +29,6 @@ OTHERWISE = {
     "simulate/calibration_images.py",
     "daemon/config/recorded.py",  # temporary folders
     "daemon/teaching/saving.py",
-    "analyse/dataset_annotations.py",  # a copy that is moved to its place when it is complete
 }
 """Files of the product that write without :mod:`gripmon.model.atomic`, and why they may."""
 

@@ -14,13 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.episode_files import WRIST
 from support.lerobot_process import FLAG, POSE
 from support.loopback import free_endpoint
 from support.network_daemon import network_config, network_daemon
 from support.remote_monitor import remote_monitor
 from test_dataset import hashes_of
-from test_dataset_annotations import FIRST, LAST, annotated, stretches
+from test_lerobot_example import EXAMPLE, FIRST, LAST, stretches, write_stretches
 
+from gripmon.analyse.stretches import Stretch
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 
@@ -95,7 +97,12 @@ def test_datasets_of_lerobot_get_columns_that_it_reads(tmp_path: Path):
     original, copy = tmp_path / "set", tmp_path / "copy"
     in_lerobot("make", root=str(original))
     hashes = hashes_of(original)
-    annotated(original, tmp_path / "out", copy, [{"stretches": stretches(0)}, {"fault": "too dark"}])
+    rows = [*stretches("#000000"), Stretch(episode="#000001", camera=WRIST, reason="too dark")]
+    write_stretches(tmp_path / "stretches", rows)
+    command = [PYTHON, str(EXAMPLE), str(original), str(tmp_path / "stretches"), str(copy)]
+    environment = os.environ | {"PYTHONPATH": str(TESTS.parent), "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=180, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
     assert hashes_of(original) == hashes, "originals are never touched"
     found = in_lerobot("shown", root=str(copy))
     assert found["flag"] == [1, 1, 1, 0, 1, 1] + [0] * 6 and found["episode"] == [0] * 6 + [1] * 6

@@ -5,13 +5,19 @@ from __future__ import annotations
 import base64
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from gripmon.analyse.content import count
-from gripmon.analyse.dataset import Journal, Line, Written, moved
+from gripmon.analyse.dataset import Results, writing
 from gripmon.analyse.page import rendered
+from gripmon.analyse.stretches import POSE_COLUMNS
+from gripmon.io.sources.episodes import Episode
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
 
@@ -19,103 +25,100 @@ _MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
 """Episodes with pictures, rows of a table, points of a plot; the Parquet table has all of them."""
 
 
-def write_page(written: Written, journal: Journal, name: str) -> None:
-    """Write the report on the dataset ``name`` where ``written`` says, replacing an earlier one."""
-    write_atomically(written.report, _page(written, journal, name))
-
-
-def _page(written: Written, journal: Journal, name: str) -> bytes:
-    """The whole page, UTF-8, which needs no network."""
+def write_page(path: Path, rows: pa.Table, results: Results, episodes: Sequence[Episode], name: str) -> None:
+    """Write the report on the dataset ``name``: one HTML file that needs no network.  ``rows``: the table's, in the
+    order of its ``episodes``, of which each has one or more.
+    """
     from plotly.offline import get_plotlyjs
 
     from gripmon.analyse.plots import as_json, mountings_figure
 
-    lines = written.lines
-    episodes: dict[str, list[Line]] = {}
-    for line in lines:
-        episodes.setdefault(line.key, []).append(line)
+    cameras, numbers = _filled(rows, "camera", ""), _filled(rows, "mounting", -1)
+    groups: dict[tuple[str, int], list[int]] = {}
+    for place in np.flatnonzero(numbers >= 0).tolist():
+        groups.setdefault((cameras[place], int(numbers[place])), []).append(place)
     figures = {
-        camera: as_json(mountings_figure(*_points(written, camera)))
-        for camera in sorted({line.camera for line, m in zip(lines, written.mountings, strict=True) if m >= 0})
+        camera: as_json(mountings_figure(*_points(rows, np.flatnonzero((numbers >= 0) & (cameras == camera)), numbers)))
+        for camera in sorted({camera for camera, _ in groups})
     }
-    failed = Counter(line.fault.partition(";")[0] for line in lines if line.fault is not None)
-    return rendered(
+    failures = rows.filter(pc.is_null(rows["start_ns"])).select(["reason", "episode"]).to_pylist()
+    reasons = Counter(str(row["reason"]).partition(";")[0] for row in failures)
+    firsts = {str(row["reason"]).partition(";")[0]: row["episode"] for row in reversed(failures)}
+    page = rendered(
         "dataset.html.j2",
         name=name,
-        summary=_summary(written, episodes),
-        mountings=_mountings(written),
-        worst=[_shown(each, journal) for each in sorted(episodes.values(), key=_badness, reverse=True)[:_MOST_SHOWN]],
-        failed=[(reason, number, _first(lines, reason)) for reason, number in failed.most_common(_MOST_ROWS)],
+        summary=_summary(rows, len(groups)),
+        mountings=[_mounting(rows, *key, groups[key]) for key in sorted(groups)],
+        worst=[_shown(results, episodes[number]) for number in _worst_first(rows)[:_MOST_SHOWN]],
+        failed=[(reason, number, firsts[reason]) for reason, number in reasons.most_common(_MOST_ROWS)],
         most_rows=_MOST_ROWS,
         figures=figures,
         plotly=get_plotlyjs() if figures else "",
     )
+    with writing(path):
+        write_atomically(path, page)
 
 
-def _summary(written: Written, episodes: dict[str, list[Line]]) -> str:
-    good = [any(s.stretch and s.stretch.verdict == Verdict.VALID for s in each) for each in episodes.values()]
-    went = sum(moved([s.stretch for s in each if s.stretch is not None]) for each in episodes.values())
-    cameras = {line.camera for line in written.lines}
-    pairs = {(line.camera, int(m)) for line, m in zip(written.lines, written.mountings, strict=True) if m >= 0}
+def _filled(rows: pa.Table, name: str, null: Any) -> NDArray[Any]:
+    return np.array(rows[name].fill_null(null).to_pylist())
+
+
+def _begins(rows: pa.Table) -> NDArray[np.intp]:
+    """The first row of each episode."""
+    return np.flatnonzero(_filled(rows, "stretch", 0) == 0)
+
+
+def _summary(rows: pa.Table, mountings: int) -> str:
+    begins = _begins(rows)
+    good = np.logical_or.reduceat(_filled(rows, "verdict", "") == Verdict.VALID.value, begins)
+    went = int(_filled(rows, "moved", False)[begins].sum())
+    cameras = len(pc.unique(rows["camera"]))
     return (
-        f"{count(len(episodes), 'episode')} of {count(len(cameras), 'camera')}: {sum(good)} with a transform that "
-        f"may be used, {len(good) - sum(good) or 'none'} without one; {count(len(pairs), 'mounting')}; "
+        f"{count(len(good), 'episode')} of {count(cameras, 'camera')}: {good.sum()} with a transform that "
+        f"may be used, {(~good).sum() or 'none'} without one; {count(mountings, 'mounting')}; "
         f"the camera moved in {went or 'none'} of them."
     )
 
 
-def _badness(lines: Sequence[Line]) -> tuple[float, float]:
-    """How far it moved, then the fraction of unusable frames; failures are in a separate table."""
-    stretches = [line.stretch for line in lines if line.stretch is not None]
-    if not stretches:
-        return -1.0, 0.0
-    far = max(max(s.motion.size_m if s.motion else 0.0, s.crept_m or 0.0) for s in stretches)
-    frames = sum(s.frames for s in stretches)
-    return far, 1.0 - sum(s.valid for s in stretches) / max(frames, 1)
+def _worst_first(rows: pa.Table) -> list[int]:
+    """Numbers of the episodes: by how far the camera moved, then by the share of frames that aren't usable; failures,
+    which have a table of their own, last.
+    """
+    begins, frames = _begins(rows), _filled(rows, "frames", 0)
+    far_m = np.maximum(_filled(rows, "motion_m", 0.0), _filled(rows, "crept_m", 0.0))
+    far_m[_filled(rows, "start_ns", -1) < 0] = -1.0
+    usable = np.add.reduceat(_filled(rows, "valid_share", 1.0) * frames, begins)
+    unusable = 1.0 - usable / np.maximum(np.add.reduceat(frames, begins), 1)
+    return [int(number) for number in np.lexsort((-unusable, -np.maximum.reduceat(far_m, begins)))]
 
 
-def _shown(lines: Sequence[Line], journal: Journal) -> dict[str, Any]:
-    pictures = journal.read(lines[0].key).pictures
+def _shown(results: Results, episode: Episode) -> dict[str, Any]:
+    rows = results.read(episode).to_pylist()
+    pictures = [base64.b64encode(row["picture"]).decode() for row in rows if row["picture"] is not None]
+    return {"episode": rows[0]["episode"], "camera": rows[0]["camera"], "rows": rows, "pictures": pictures}
+
+
+def _mounting(rows: pa.Table, camera: str, number: int, places: Sequence[int]) -> dict[str, Any]:
+    at_m, episodes = _tcp_m(rows, places), rows["episode"]
+    middle_m = np.median(at_m, axis=0)
     return {
-        "episode": lines[0].episode,
-        "camera": lines[0].camera,
-        "lines": lines,
-        "pictures": [base64.b64encode(picture).decode() for picture in pictures],
-    }
+        "camera": camera, "number": number, "stretches": len(places), "first": episodes[places[0]].as_py(),
+        "last": episodes[places[-1]].as_py(), "tcp_mm": " ".join(f"{1e3 * value:.2f}" for value in middle_m),
+        "spread_m": float(np.linalg.norm(at_m - middle_m, axis=1).max()),
+    }  # fmt: skip
 
 
-def _first(lines: Sequence[Line], reason: str) -> str:
-    return next(line.episode for line in lines if line.fault is not None and line.fault.partition(";")[0] == reason)
+def _tcp_m(rows: pa.Table, places: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:
+    """(n, 3) of some rows."""
+    some = rows.select(list(POSE_COLUMNS[:3])).take(places)
+    return np.column_stack([column.to_numpy() for column in some.columns])
 
 
-def _mountings(written: Written) -> list[dict[str, Any]]:
-    groups: dict[tuple[str, int], list[Line]] = {}
-    for line, number in zip(written.lines, written.mountings.tolist(), strict=True):
-        if number >= 0:
-            groups.setdefault((line.camera, number), []).append(line)
-    out = []
-    for (camera, number), lines in sorted(groups.items()):
-        at = np.array([line.stretch.cam_T_grip[:3] for line in lines if line.stretch and line.stretch.cam_T_grip])
-        middle = np.median(at, axis=0)
-        out.append(
-            {
-                "camera": camera, "number": number, "stretches": len(lines), "first": lines[0].episode,
-                "last": lines[-1].episode, "tcp_mm": " ".join(f"{1e3 * value:.2f}" for value in middle),
-                "spread_m": float(np.linalg.norm(at - middle, axis=1).max()),
-            }
-        )  # fmt: skip
-    return out
-
-
-def _points(written: Written, camera: str) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Episodes, TCPs (n, 3) relative to the first, m, and mountings (n,) of a camera; thinned if there are many."""
-    places = [
-        place
-        for place, (line, number) in enumerate(zip(written.lines, written.mountings, strict=True))
-        if line.camera == camera and number >= 0
-    ]
+def _points(
+    rows: pa.Table, places: NDArray[np.intp], numbers: NDArray[np.int64]
+) -> tuple[list[str], NDArray[np.float64], NDArray[np.int64]]:
+    """Names, TCPs (n, 3) relative to the first, m, and mountings (n,) of some rows; thinned if there are many."""
     places = places[:: max(len(places) // _MOST_POINTS, 1)]
-    stretches = [written.lines[place].stretch for place in places]
-    at = np.array([one.cam_T_grip[:3] for one in stretches if one is not None and one.cam_T_grip is not None])
-    names = [f"{written.lines[place].episode}, stretch {written.lines[place].number}" for place in places]
-    return names, at - at[0], written.mountings[places]
+    at_m = _tcp_m(rows, places)
+    named = rows.select(["episode", "stretch"]).take(places).to_pylist()
+    return [f"{row['episode']}, stretch {row['stretch']}" for row in named], at_m - at_m[0], numbers[places]

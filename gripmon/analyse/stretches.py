@@ -1,68 +1,87 @@
-"""An episode's transforms, reduced to one per stretch in which the camera stood still relative to the gripper."""
+"""An episode's transforms, reduced to one for each stretch in which the camera stood still relative to the gripper."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections import Counter
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from gripmon.analyse.corrected import correct_table
-from gripmon.analyse.correction import ChangePoint, Correction
+from gripmon.analyse.correction import ChangePoint
 from gripmon.analyse.vectors import to_vectors
-from gripmon.calibrate.verify import CHANCE, compare_hand_eye, mean_of_one_scene
+from gripmon.calibrate.verify import CHANCE, HandEyeDifference, compare_hand_eye, mean_of_one_scene
 from gripmon.judge.policy import PolicySettings, past_alert_limit
 from gripmon.model.geometry import to_record
-from gripmon.model.records import Alert, Array, Protection, Verdict
-from gripmon.record.table import FrameTable
+from gripmon.model.lerobot_columns import POSE_NAMES
+from gripmon.model.records import Alert, Array, Protection, ValidBy, Verdict
+from gripmon.model.units import in_mm
+from gripmon.record.table import FrameTable, pose_matrices
 
 _NUMBER = re.compile(r"\d[\d.e+-]*")
+POSE_COLUMNS = tuple(f"cam_T_grip_{name}" for name in POSE_NAMES)
 Bools = NDArray[np.bool_]
+Number = float | None
+Integer = int | None
+Text = str | None
+Numbers = tuple[float, ...] | None
+Runs = tuple[tuple[int, int], ...] | None
 
 
-def _is(text: str) -> Meta:
-    return Meta(description=text)
-
-
-class Motion(msgspec.Struct, frozen=True):
-    """The motion before a stretch."""
-
-    stamp_ns: Annotated[int, _is("when the camera moved, most probably")]
-    earliest_ns: Annotated[int, _is("it had not moved by then, in 95 of 100 cases")]
-    latest_ns: int
-    shift_m: Annotated[tuple[float, float, float], _is("of the TCP, along the camera's axes")]
-    size_m: Annotated[float, _is("its length")]
-    rotation_rad: Annotated[float, _is("the turn")]
-    p_value: Annotated[float, _is("probability of as large a difference if it stood still")]
-    cause: Annotated[str, _is("the most probable cause of the alerts on it; unknown if there is none")]
+def _is(text: str, *columns: str) -> Meta:
+    """Description of a field; ``columns``: it is a tuple with one of the table's columns for each number."""
+    return Meta(description=text, extra={"columns": columns})
 
 
 class Stretch(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames between two motions, and the transform that holds in all of them."""
+    """A row of the table: the frames between two motions of the camera and the transform that holds in all of them; or,
+    with ``verdict`` unknown and ``reason``, an episode of which nothing is known.
+    """
 
-    start_ns: int
-    end_ns: int
-    frames: int
-    measured: Annotated[int, _is("frames with a transform of their own")]
-    valid: Annotated[int, _is("frames whose transform was valid")]
-    verdict: Annotated[
-        str, _is("valid: it comes from valid frames; suspect: it doesn't, or is off; unknown: not measured")
-    ]
-    cam_T_grip: Annotated[tuple[float, ...] | None, _is("x, y, z (m), quaternion x, y, z, w; null: unknown")] = None
-    covariance: Annotated[tuple[float, ...] | None, _is("36 values; a single frame's, not a mean's")] = None
-    protection_m: Annotated[float | None, _is("bound on its position error in each valid frame; null: none")] = None
-    protection_rad: float | None = None
-    integrity_risk: Annotated[float | None, _is("probability per frame that a bound is exceeded")] = None
-    crept_m: Annotated[float | None, _is("from its first half to its second; null: not beyond chance")] = None
-    not_valid_ns: Annotated[tuple[tuple[int, int], ...], _is("first and last of frames in which it isn't valid")] = ()
-    motion: Annotated[Motion | None, _is("null: the episode begins with it")] = None
-    reasons: Annotated[str, _is("why frames weren't valid, the most frequent first")] = ""
+    camera: Annotated[str, _is("topic, feature, or the configuration's name")] = ""
+    episode: Annotated[str, _is("path below the dataset; of LeRobot with # and its number")] = ""
+    stretch: Annotated[int, _is("0, 1, … in order of time; each motion begins another")] = 0
+    verdict: Annotated[str, _is("valid: use the transform; suspect, unknown: don't")] = Verdict.UNKNOWN.value
+    mounting: Annotated[Integer, _is("what has the same number (and camera) shares a mounting; null: not known")] = None
+    start_ns: Annotated[Integer, _is("first frame's stamp (ns; of LeRobot from the episode's beginning)")] = None
+    end_ns: Annotated[Integer, _is("last frame's stamp (ns)")] = None
+    frames: Annotated[int, _is("in the stretch")] = 0
+    measured_share: Annotated[Number, _is("of its frames with a transform of their own, 0 to 1")] = None
+    valid_share: Annotated[Number, _is("of its frames whose transform was valid, 0 to 1")] = None
+    cam_T_grip: Annotated[Numbers, _is("gripper to camera coordinates, as measured; null: none", *POSE_COLUMNS)] = None
+    covariance: Annotated[Numbers, _is("6 x 6 by rows, position (m) then rotation (rad), camera axes")] = None
+    valid_by: Annotated[Text, _is("which error protection bounds: absolute; reference, of the motion since it")] = None
+    protection_m: Annotated[Number, _is("bound on the position error in each valid frame of it; null: none")] = None
+    protection_rad: Annotated[Number, _is("bound on the rotation error")] = None
+    integrity_risk: Annotated[Number, _is("probability per frame that the error exceeds a bound")] = None
+    since_reference_m: Annotated[Number, _is("bound on the position error of the motion since since_ns")] = None
+    since_reference_rad: Annotated[Number, _is("bound on its rotation error")] = None
+    since: Annotated[Text, _is("what that counts from, in this episode: reference, or first_proved frames")] = None
+    since_ns: Annotated[Integer, _is("stamp of these frames; null: not known")] = None
+    absolute_m: Annotated[Number, _is("bound on the position error with what is wrong in every episode alike")] = None
+    absolute_rad: Annotated[Number, _is("bound on the rotation error, likewise")] = None
+    moved: Annotated[bool | None, _is("the camera moved within this episode, at once or slowly")] = None
+    crept_m: Annotated[Number, _is("from its first half to its second, on average; null: not beyond chance")] = None
+    not_valid_ns: Annotated[Runs, _is("first and last stamp of each run of frames in which it isn't valid")] = None
+    motion_ns: Annotated[Integer, _is("when the camera moved, before this stretch; null: it is the first")] = None
+    motion_earliest_ns: Annotated[Integer, _is("it had not moved by then, in 95 of 100 cases")] = None
+    motion_latest_ns: Annotated[Integer, _is("it had moved by then")] = None
+    motion_m: Annotated[Number, _is("how far the TCP moved")] = None
+    motion_xyz_m: Annotated[Numbers, _is("along the camera's axes", *(f"motion_{axis}_m" for axis in "xyz"))] = None
+    motion_rad: Annotated[Number, _is("its turn")] = None
+    motion_p_value: Annotated[Number, _is("probability of as large a difference by chance")] = None
+    motion_cause: Annotated[Text, _is("most probable cause by the alerts; unknown: none is probable enough")] = None
+    own_reference: Annotated[bool, _is("recalibrated from this episode; false: against the configuration's")] = False
+    lens: Annotated[str, _is("whose camera calibration: file or configuration")] = "configuration"
+    gripper: Annotated[Text, _is("gripper file by which it was measured; null: none")] = None
+    reason: Annotated[Text, _is("why there is no transform, or why frames weren't valid")] = None
+    picture: Annotated[bytes | None, _is("JPEG with what was measured; null: none")] = None
 
 
 def stretches_of(
@@ -73,134 +92,138 @@ def stretches_of(
 
     The camera moved where the off-line smoother finds a change point and the transforms before and after it differ by
     ``verify``'s test at :data:`CHANCE`; otherwise it is one stretch.  Raises ValueError if too little was measured.
+
+    A stretch's transform is always the one as measured, also where ``valid_by`` is ``reference``: what is published
+    then is the reference after the motion since the episode's first frames, which says nothing about where the camera
+    was before them.  The bound that ``valid_by`` names is widened by how far each frame's published transform is from
+    the stretch's, so that it holds for that.
     """
-    correction = correct_table(table, lambda: None)
-    poses, measured = table.matrices(), ~table.refused & np.isfinite(table.cam_T_grip).all(axis=1)
-    valid = measured & (table.verdict == table.VERDICTS.index(Verdict.VALID.value))
-    begins: list[int] = [0]
-    motions: list[Motion | None] = [None]
-    for point in correction.change_points:
-        motion = _motion(table, poses, valid, measured, point, begins[-1], _next(correction, point), alerts)
-        if motion is not None:
+    episode = _Episode(table, alerts, reasons, policy)
+    begins, motions = [0], [dict[str, Any]()]
+    ends = [*(point.index for point in episode.change_points[1:]), len(table)]
+    for point, end in zip(episode.change_points, ends, strict=False):  # without a change point there is one end more
+        if (motion := episode.motion(point, begins[-1], end)) is not None:
             begins.append(point.index)
             motions.append(motion)
-    ends = [*begins[1:], len(table)]
-    return [
-        _stretch(table, correction, poses, valid, measured, slice(begin, end), motion, reasons, policy)
-        for begin, end, motion in zip(begins, ends, motions, strict=True)
+    rows = [
+        episode.stretch(number, slice(begin, end), motion)
+        for number, (begin, end, motion) in enumerate(zip(begins, [*begins[1:], len(table)], motions, strict=True))
     ]
+    moved = len(rows) > 1 or rows[0].crept_m is not None
+    return [msgspec.structs.replace(row, moved=moved) for row in rows]
 
 
-def _next(correction: Correction, point: ChangePoint) -> int:
-    later = [other.index for other in correction.change_points if other.index > point.index]
-    return min(later, default=len(correction.stamp_ns))
-
-
-def _used(valid: Bools, measured: Bools, part: slice) -> NDArray[np.intp]:
-    """The frames from which a transform is averaged: the valid ones, or if there are none all measured ones."""
-    rows = np.flatnonzero(valid[part])
-    return part.start + (rows if len(rows) else np.flatnonzero(measured[part]))
-
-
-def _motion(
-    table: FrameTable,
-    poses: Array,
-    valid: Bools,
-    measured: Bools,
-    point: ChangePoint,
-    begin: int,
-    end: int,
-    alerts: Sequence[tuple[int, Alert]],
-) -> Motion | None:
-    sides = [_used(valid, measured, slice(begin, point.index)), _used(valid, measured, slice(point.index, end))]
-    if not all(len(side) for side in sides):
-        return None
-    (a, A), (b, B) = (mean_of_one_scene(list(poses[side]), list(table.covariance[side])) for side in sides)
-    found = compare_hand_eye(a, A, b, B)
-    if found.p_value >= CHANCE:
-        return None
-    x, y, z = found.position_m.tolist()
-    around = [alert for stamp_ns, alert in alerts if point.earliest_ns <= stamp_ns <= int(table.stamp_ns[end - 1])]
-    causes = [str(alert.cause) for alert in around if alert.tcp_shift_m is not None and str(alert.cause) != "unknown"]
-    return Motion(
-        point.stamp_ns,
-        point.earliest_ns,
-        point.latest_ns,
-        (x, y, z),
-        float(np.linalg.norm(found.position_m)),
-        float(np.linalg.norm(found.rotation_rad)),
-        found.p_value,
-        causes[-1] if causes else "unknown",
-    )
-
-
-def _stretch(
-    table: FrameTable,
-    correction: Correction,
-    poses: Array,
-    valid: Bools,
-    measured: Bools,
-    part: slice,
-    motion: Motion | None,
-    reasons: Sequence[str | None],
-    policy: PolicySettings,
-) -> Stretch:
-    # Numbers differ from frame to frame, and so does text in brackets.
-    why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in reasons[part] if reason)
-    counted = "; ".join(f"{count} times: {reason}" for reason, count in why.most_common(3))
-    plain = {
-        "start_ns": int(table.stamp_ns[part.start]), "end_ns": int(table.stamp_ns[part.stop - 1]),
-        "frames": part.stop - part.start, "measured": int(measured[part].sum()), "valid": int(valid[part].sum()),
-        "motion": motion, "not_valid_ns": _runs(table.stamp_ns[part], np.ones(part.stop - part.start, dtype=bool)),
-    }  # fmt: skip
-    used = _used(valid, measured, part)
-    if not len(used):
-        return Stretch(verdict=Verdict.UNKNOWN.value, reasons=counted, **plain)
-    mean, covariance = mean_of_one_scene(list(poses[used]), list(table.covariance[used]))
-    away = to_vectors(mean, poses[used])
-    bounds = np.column_stack([
-        table.protection_m[used] + np.linalg.norm(away[:, :3], axis=1),
-        table.protection_rad[used] + np.linalg.norm(away[:, 3:], axis=1),
-    ])  # fmt: skip
-    record = to_record(mean)
-    halves = [used[: (len(used) + 1) // 2], used[len(used) // 2 :]]
-    (a, A), (b, B) = (
-        mean_of_one_scene(list(correction.cam_T_grip[half]), list(correction.covariance[half])) for half in halves
-    )
-    crept = compare_hand_eye(a, A, b, B)
-    moved = crept.p_value < CHANCE
-    holds = valid[used] & _within(bounds, policy, all_or_none=moved)
-    if holds.any():
-        bounds = bounds[holds]
-    elif valid[used].all():
-        beyond = _past_limit(bounds.max(axis=0), policy)
-        counted = "; ".join(text for text in (f"as one transform {beyond}", counted) if text)
-    out = np.ones(len(table), dtype=bool)
-    out[used[holds]] = False
-    plain |= {"not_valid_ns": _runs(table.stamp_ns[part], out[part]), "reasons": counted}
-    return Stretch(
-        verdict=Verdict.VALID.value if holds.any() else Verdict.SUSPECT.value,
-        cam_T_grip=(*record.translation_m, *record.rotation_xyzw),
-        covariance=tuple(covariance.ravel().tolist()),
-        protection_m=_largest(bounds[:, 0]),
-        protection_rad=_largest(bounds[:, 1]),
-        integrity_risk=_largest(table.integrity_risk[used]),
-        crept_m=float(np.linalg.norm(crept.position_m)) if moved else None,
-        **plain,
-    )
-
-
-def _within(bounds: Array, policy: PolicySettings, *, all_or_none: bool) -> Bools:
-    """(n,) frames whose bounds (n, 2), m and rad, are within the alert limits.  With ``all_or_none``, for a camera that
-    crept, none is unless all are: those who join frames to its one transform are told that they are several.
+class _Episode:
+    """``poses`` (n, 4, 4): as measured; ``named`` (n, 4, 4): what ``valid_by`` names, which ``bounds`` (n, 2), m and
+    rad, are about; ``measured``, ``valid`` (n,): which frames are.
     """
-    within = np.array([_past_limit(bound, policy) is None for bound in bounds])
-    return within & (within.all() or not all_or_none)
+
+    def __init__(
+        self,
+        table: FrameTable,
+        alerts: Sequence[tuple[int, Alert]],
+        reasons: Sequence[str | None],
+        policy: PolicySettings,
+    ) -> None:
+        self.table, self.alerts, self.reasons, self.policy = table, alerts, reasons, policy
+        self.smoothed = correct_table(dataclasses.replace(table, cam_T_grip=table.absolute), lambda: None)
+        self.change_points = sorted(self.smoothed.change_points, key=lambda point: point.index)
+        self.poses, self.named = pose_matrices(table.absolute), table.matrices()
+        self.bounds = np.column_stack([table.protection_m, table.protection_rad])
+        self.measured: Bools = ~table.refused & np.isfinite(table.absolute).all(axis=1)
+        self.valid: Bools = self.measured & (table.verdict == table.VERDICTS.index(Verdict.VALID.value))
+
+    def used(self, part: slice) -> NDArray[np.intp]:
+        """The frames from which a transform is averaged: the valid ones, or if there are none all measured ones."""
+        rows = np.flatnonzero(self.valid[part])
+        return part.start + (rows if len(rows) else np.flatnonzero(self.measured[part]))
+
+    def motion(self, point: ChangePoint, begin: int, end: int) -> dict[str, Any] | None:
+        """The columns of the motion at a change point between two frames; None where it is no more than chance."""
+        before, after = self.used(slice(begin, point.index)), self.used(slice(point.index, end))
+        if not len(before) or not len(after):
+            return None
+        found = _compared(self.poses, self.table.covariance, before, after)
+        if found.p_value >= CHANCE:
+            return None
+        last_ns = int(self.table.stamp_ns[end - 1])
+        around = [alert for stamp_ns, alert in self.alerts if point.earliest_ns <= stamp_ns <= last_ns]
+        causes = [str(alert.cause) for alert in around if alert.tcp_shift_m is not None]
+        return {
+            "motion_ns": point.stamp_ns, "motion_earliest_ns": point.earliest_ns, "motion_latest_ns": point.latest_ns,
+            "motion_m": float(np.linalg.norm(found.position_m)), "motion_xyz_m": tuple(found.position_m.tolist()),
+            "motion_rad": float(np.linalg.norm(found.rotation_rad)), "motion_p_value": found.p_value,
+            "motion_cause": next((cause for cause in reversed(causes) if cause != "unknown"), "unknown"),
+        }  # fmt: skip
+
+    def stretch(self, number: int, part: slice, motion: dict[str, Any]) -> Stretch:
+        """The row of the frames ``part``, before which the camera made a ``motion``, empty for the first."""
+        table, stamp_ns, used = self.table, self.table.stamp_ns[part], self.used(part)
+        row = motion | {
+            "stretch": number, "start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1]), "frames": len(stamp_ns),
+            "measured_share": float(self.measured[part].mean()), "valid_share": float(self.valid[part].mean()),
+            "valid_by": table.VALID_BY[table.valid_by[part.start]],
+        }  # fmt: skip
+        # Numbers differ from frame to frame, and so does text in brackets.
+        why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in self.reasons[part] if reason)
+        reasons = [f"{count} times: {reason}" for reason, count in why.most_common(3)]
+        holds = np.zeros(len(table), dtype=bool)
+        if len(used):
+            mean, covariance = mean_of_one_scene(list(self.poses[used]), list(table.covariance[used]))
+            halves = used[: (len(used) + 1) // 2], used[len(used) // 2 :]
+            crept = _compared(self.smoothed.cam_T_grip, self.smoothed.covariance, *halves)
+            moved = crept.p_value < CHANCE
+            bounds = self.bounds[used] + _lengths(mean, self.named[used])
+            within = (bounds <= [self.policy.alert_limit_m, self.policy.alert_limit_rad]).all(axis=1)
+            # Those who join a camera that crept to its one transform are told that they are several.
+            holds[used] = self.valid[used] & within & (within.all() or not moved)
+            if self.valid[used].all() and not holds.any():
+                reasons.insert(0, self._beyond(bounds.max(axis=0), mean, used))
+            record = to_record(mean)
+            row |= {
+                "verdict": Verdict.VALID.value if holds.any() else Verdict.SUSPECT.value,
+                "cam_T_grip": (*record.translation_m, *record.rotation_xyzw),
+                "covariance": tuple(covariance.ravel().tolist()),
+                "crept_m": float(np.linalg.norm(crept.position_m)) if moved else None,
+                **self._bounds(mean, used[holds[used]] if holds.any() else used),
+            }
+        return Stretch(**row, not_valid_ns=_runs(stamp_ns, ~holds[part]), reason="; ".join(reasons) or None)
+
+    def _beyond(self, bound: Array, mean: Array, used: NDArray[np.intp]) -> str:
+        """Why valid frames give no valid row."""
+        text = f"as one transform {past_alert_limit(Protection(float(bound[0]), float(bound[1]), 0.0), self.policy)}"
+        if self.policy.valid_by is ValidBy.ABSOLUTE:
+            return text
+        away_m = float(np.median(_lengths(mean, self.named[used])[:, 0]))
+        return f"{text}, measured {in_mm(away_m)} mm from where the reference has it"
+
+    def _bounds(self, mean: Array, rows: NDArray[np.intp]) -> dict[str, Any]:
+        """The columns of the bounds on one transform for all of ``rows``."""
+        table = self.table
+        way = _lengths(mean, self.poses[rows])
+        since = np.column_stack([table.since_reference_m[rows], table.since_reference_rad[rows]]) + way
+        absolute = np.column_stack([table.absolute_m[rows], table.absolute_rad[rows]]) + way
+        published = self.bounds[rows] + _lengths(mean, self.named[rows])
+        bounds = {"protection": published, "since_reference": since, "absolute": absolute}
+        known = {f"{name}_m": _largest(values[:, 0]) for name, values in bounds.items()}
+        known |= {f"{name}_rad": _largest(values[:, 1]) for name, values in bounds.items()}
+        since_code, since_ns = int(table.since[rows[-1]]), int(table.since_ns[rows[-1]])
+        return known | {
+            "integrity_risk": _largest(table.integrity_risk[rows]),
+            "since": table.SINCE[since_code] if since_code >= 0 else None,
+            "since_ns": since_ns if since_ns >= 0 else None,
+        }
 
 
-def _past_limit(bound: Array, policy: PolicySettings) -> str | None:
-    position_m, rotation_rad = bound.tolist()
-    return past_alert_limit(Protection(position_m, rotation_rad, 0.0), policy)
+def _compared(poses: Array, covariances: Array, before: NDArray[np.intp], after: NDArray[np.intp]) -> HandEyeDifference:
+    (a, A), (b, B) = (mean_of_one_scene(list(poses[rows]), list(covariances[rows])) for rows in (before, after))
+    return compare_hand_eye(a, A, b, B)
+
+
+def _lengths(mean: Array, poses: Array) -> Array:
+    """(n, 2) how far transforms (n, 4, 4) are from one (4, 4): the TCP, m, and the turn, rad."""
+    away = to_vectors(mean, poses)
+    return np.column_stack([np.linalg.norm(away[:, :3], axis=1), np.linalg.norm(away[:, 3:], axis=1)])
 
 
 def _runs(stamp_ns: NDArray[np.int64], chosen: Bools) -> tuple[tuple[int, int], ...]:
@@ -212,39 +235,3 @@ def _runs(stamp_ns: NDArray[np.int64], chosen: Bools) -> tuple[tuple[int, int], 
 def _largest(values: Array) -> float | None:
     """The largest; None if any is unknown, since there is no bound then."""
     return float(values.max()) if np.isfinite(values).all() else None
-
-
-def mountings_of(
-    cam_T_grip: Array,
-    covariance: Array,
-    level: float = 0.01,
-    tolerance_m: float = 0.0,
-    tolerance_rad: float = 0.0,
-) -> NDArray[np.int64]:
-    """The mounting (n,) of each transform (n, 4, 4) with covariances (n, 6, 6): numbers from 0, in the order of their
-    first occurrence.
-
-    The most certain transform represents its mounting: all others belong to it that ``verify``'s test can't distinguish
-    from it, or that are within both tolerances; this is repeated for the rest.  A transform that agrees with several
-    belongs to the first.  ``level`` is the probability that any of the n is wrongly separated from its mounting, so
-    that each test has ``level / n``.
-    """
-    count = len(cam_T_grip)
-    out = np.full(count, -1, np.int64)
-    certain = np.argsort(np.linalg.slogdet(covariance)[1] if count else np.empty(0), kind="stable")
-    leaders = 0
-    for leader in certain.tolist():
-        if out[leader] >= 0:
-            continue
-        left = np.flatnonzero(out < 0)
-        xi = to_vectors(cam_T_grip[leader], cam_T_grip[left])
-        chi2 = np.einsum(
-            "ni,ni->n", xi, np.linalg.solve(covariance[leader] + covariance[left], xi[:, :, None])[:, :, 0]
-        )
-        near = (np.linalg.norm(xi[:, :3], axis=1) <= tolerance_m) & (np.linalg.norm(xi[:, 3:], axis=1) <= tolerance_rad)
-        same = (chdtrc(6, chi2) >= level / count) | near
-        out[left[same]] = leaders
-        out[leader] = leaders
-        leaders += 1
-    _, first, inverse = np.unique(out, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse] if count else out

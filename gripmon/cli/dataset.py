@@ -13,9 +13,7 @@ DATASET          folder or URL; all episodes below it are measured
 --config CONFIG  configuration (YAML) with gripper, camera and a rough reference; its source section gives the opening
 --out DIR        folder for the results; created if missing
 --camera NAME...  a topic of .mcap and rosbag2, a feature of LeRobot; may be repeated (default: the only one)
---gripper FILE...    other grippers that an episode may show; the one that fits is used; if none does, the row says why
 --own-lens       use the configuration's camera calibration even if a file contains one
---annotate DIR   also write in the dataset's own format; DATASET itself: beside its recordings (not for LeRobot)
 --engine NAME    local (processes on this machine, the default) or ray (a Ray cluster)
 --workers N      processes of --engine local (default: the number of cores)
 --address HOST   address of the Ray cluster, as for ray.init (default: the one that Ray finds, or this machine)
@@ -45,7 +43,6 @@ def _probability(text: str) -> float:
     config=REQUIRED, out=REQUIRED, engine={"choices": ("local", "ray")},
     workers=whole_number(1, 4096, "isn't a number of processes; 1 or more"),
     level=_probability, tolerance_mm=positive_number, tolerance_deg=positive_number, dataset=str, address=str,
-    annotate=str,
 )  # fmt: skip
 def dataset(arguments: Arguments) -> int:
     """Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
@@ -54,12 +51,9 @@ def dataset(arguments: Arguments) -> int:
     (s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
     and is never modified.  Below DIR:
 
-      stretches/camera=NAME/part-00000.parquet   a row for each stretch without motion, failures included
-      report.html                                mountings over time, failures, the worst episodes
-      journal.jsonl                              measured episodes: a new call measures only the rest
-
-    With --annotate an MCAP for each recording (NAME.gripmon.mcap), and for LeRobot datasets a copy with the
-    columns observation.extrinsics.CAMERA and observation.extrinsics_valid.CAMERA, whose videos are links.
+      stretches/camera=NAME/part-0.parquet   a row for each stretch without motion, failures included
+      report.html                            mountings over time, failures, the worst episodes
+      episodes-…/                            a file for each measured episode: a new call measures only the rest
     """
     from gripmon.daemon.dataset import measure_dataset
 
@@ -78,11 +72,9 @@ def dataset(arguments: Arguments) -> int:
             level=arguments.level or 0.01,
             tolerance_m=arguments.metres("tolerance_mm") or 0.0,
             tolerance_rad=arguments.radians("tolerance_deg") or 0.0,
-            annotate=arguments.annotate,
-            grippers=arguments.gripper or (),
             step=step,
         )
     good = found.episodes - found.failed
     counts = f"{found.episodes} episodes, {found.measured} measured now, {found.failed} without a transform"
-    note([f"dataset: {counts}; {found.written.table}, {found.written.report}"])
+    note([f"dataset: {counts}; {found.table}, {found.report}"])
     return EXIT_DONE if good else EXIT_FAILED

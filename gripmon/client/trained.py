@@ -108,7 +108,7 @@ def columns_of(dataset: Any, names: tuple[str, str]) -> tuple[Array, Array]:
 
     absent = [name for name in names if name not in dataset.meta.features]
     if absent:
-        right = "one recorded with gripmon's step, or the copy that gripmon dataset --annotate makes"
+        right = "one recorded with gripmon's step, or the copy that docs/examples/lerobot_extrinsics.py makes"
         raise ValueError(f"{dataset.repo_id} has no column {absent[0]}; {right}")
     # Read the plain table: the dataset's own access would also decode the videos.
     table = dataset.hf_dataset.with_format("numpy").select_columns(list(names))[:]

@@ -1,139 +1,169 @@
 """Measures episodes in processes of this machine or on a Ray cluster.  Both keep few in flight, so that memory doesn't
-grow with the dataset, and return a result for each, also for one that kills its worker.
+grow with the dataset, and return rows for each, also for one that kills its worker.
 """
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
+import signal
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Sequence
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from gripmon.analyse.dataset import Measured
-from gripmon.daemon.dataset.measuring import Configs, failed, measure
+from gripmon.daemon.config import Config
+from gripmon.daemon.dataset.measuring import Rows, failed, measure
 from gripmon.io.sources.episodes import Episode
 from gripmon.model.errors import InputError, one_line
 from gripmon.model.stopping import end_with_parent
 
-AHEAD = 2
-"""Episodes in flight per worker: one being measured and one waiting, so that no worker is idle."""
-WORKER_EPISODES = 50
-"""A worker is replaced after this many: each leaks about 3 MB, 0.15 GB until then, of unknown cause; the 2 s of its
-start are one or two per cent of its time.
+ENGINES = ("local", "ray")
+WORKER_EPISODES = 200
+"""A worker is replaced after this many, lest what a decoder keeps adds up: its memory grew by 55 MB over 30 episodes
+and not at all over the next 30, and its start is half a per cent of its time.
 """
-DIED = "the process that measured it died, also when it was alone (out of memory, or a decoder that crashed)"
+TRIES = 2
+"""Workers that an episode may cost here: one may have been short of memory because of another one."""
+DIED = "the process that measured it died, also when it was tried again (out of memory, or a decoder that crashed)"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_RAY_TRIES = 3
+_RAY_TRIES, _RAY_AHEAD = 3, 2
+"""Workers that an episode may cost there; tasks in flight for each core, so that none waits for the driver."""
 
-_given: tuple[Configs, str] | None = None
+Measuring = Callable[[Config, Episode, str], Rows]
 
 
-def _begin(configs: Configs, lens: str) -> None:
-    """Initialise a worker."""
-    global _given
+class _Worker:
+    """A process that measures one episode at a time."""
+
+    def __init__(self, config: Config, lens: str, work: Measuring) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, config, lens, work), daemon=True)
+        self.process.start()
+        theirs.close()  # so that the end of the process is the end of the connection
+        self.began, self.measured = False, 0
+
+    def end(self) -> None:
+        """End the process, whatever it does, and wait until it has ended."""
+        self.process.terminate()
+        self.process.join()
+        self.connection.close()
+
+
+def _serve(connection: Connection, config: Config, lens: str, work: Measuring) -> None:
     import cv2
 
-    cv2.setNumThreads(1)
-    _given = configs, lens
-
-
-def _begin_here(configs: Configs, lens: str) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which ends its workers
     end_with_parent()
-    _begin(configs, lens)
-
-
-def _work(episode: Episode) -> Measured:
-    assert _given is not None, "a worker begins with _begin"
-    configs, lens = _given
-    return measure(configs, episode, lens)
+    cv2.setNumThreads(1)
+    connection.send(None)
+    with contextlib.suppress(EOFError):
+        while True:
+            connection.send(work(config, connection.recv(), lens))
 
 
 def local(
-    configs: Configs,
-    episodes: Sequence[Episode],
-    lens: str,
-    workers: int,
-    work: Callable[[Episode], Measured] = _work,
-) -> Iterator[Measured]:
-    """Measure in ``workers`` processes, each replaced after :data:`WORKER_EPISODES`.  If one dies, the episodes in
-    flight are measured again one by one; an episode that kills its worker again is given up.
+    config: Config, episodes: Sequence[Episode], lens: str, workers: int, work: Measuring = measure
+) -> Generator[tuple[Episode, Rows], None, None]:
+    """Measure in ``workers`` processes, each replaced after :data:`WORKER_EPISODES`; an episode that kills
+    :data:`TRIES` of them is given up.  Raises :class:`InputError` if a process can't even begin.
     """
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
-    waiting, suspects = deque(episodes), deque[Episode]()
-    while waiting or suspects:
-        alone = bool(suspects)
-        queue, count = (suspects, 1) if alone else (waiting, workers)
-        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin_here, (configs, lens)) as pool:
-            flying: dict[Future[Measured], Episode] = {}
-            left = count * WORKER_EPISODES
-            try:
-                while (queue and left) or flying:
-                    while queue and left and len(flying) < (1 if alone else AHEAD * count):
-                        left -= 1
-                        episode = queue.popleft()
-                        try:
-                            flying[pool.submit(work, episode)] = episode
-                        except BrokenProcessPool:
-                            queue.appendleft(episode)
-                            raise
-                    for done in wait(flying, return_when=FIRST_COMPLETED).done:
-                        measured = done.result()
-                        flying.pop(done)
-                        yield measured
-            except BrokenProcessPool:
-                finished = [future for future in flying if future.done() and future.exception() is None]
-                yield from (future.result() for future in finished)
-                lost = [episode for future, episode in flying.items() if future not in finished]
-                if alone:
-                    yield from (failed(configs, episode, DIED) for episode in lost)
+    waiting, tries = deque(episodes), dict.fromkeys((episode.key for episode in episodes), 0)
+    idle: list[_Worker] = []
+    busy: dict[Any, tuple[_Worker, Episode]] = {}
+
+    def assign() -> None:
+        while waiting and len(busy) < workers:
+            worker, episode = idle.pop() if idle else _Worker(config, lens, work), waiting.popleft()
+            busy[worker.connection] = worker, episode
+            with contextlib.suppress(OSError):  # it has died, which is told when its answer is read
+                worker.connection.send(episode)
+
+    try:
+        assign()
+        while busy:
+            for connection in wait(list(busy)):
+                worker, episode = busy[connection]
+                try:
+                    rows: Rows | None = worker.connection.recv()
+                except (EOFError, OSError):
+                    worker.end()
+                    if not worker.began:
+                        text = f"a process can't begin (exit code {worker.process.exitcode}); what it wrote is above"
+                        raise InputError(text, "engine") from None
+                    tries[episode.key] += 1
+                    rows = failed(config, episode, DIED) if tries[episode.key] >= TRIES else None
+                    waiting.extendleft([] if rows else [episode])
                 else:
-                    suspects.extend(lost)
-            except GeneratorExit:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+                    if rows is None:
+                        worker.began = True
+                        continue
+                    worker.measured += 1
+                    if worker.measured < WORKER_EPISODES:
+                        idle.append(worker)
+                    else:
+                        worker.end()
+                del busy[connection]
+                assign()
+                if rows:
+                    yield episode, rows
+    finally:
+        for worker in (*idle, *(each for each, _ in busy.values())):
+            worker.end()
 
 
-def ray_cluster(configs: Configs, episodes: Sequence[Episode], lens: str, address: str | None) -> Iterator[Measured]:
-    """Measure on the Ray cluster at ``address`` (None: the one that Ray finds, or this machine).  Ray retries an
-    episode whose worker died; one that kills three workers is given up.
+def on_ray(
+    config: Config, episodes: Sequence[Episode], lens: str, address: str | None
+) -> Generator[tuple[Episode, Rows], None, None]:
+    """Measure on the Ray cluster at ``address`` (None: the one that Ray finds, or this machine), on as many nodes as it
+    has at a time.  Ray retries an episode whose worker died; one that kills :data:`_RAY_TRIES` is given up.
 
-    Raises :class:`InputError` without Ray, or if no cluster answers.
+    Raises :class:`InputError` without Ray, if no cluster answers, and if it is lost or can't run tasks.
     """
+    if not episodes:
+        return
     try:
         import ray
+        from ray.exceptions import OutOfMemoryError, RayError, WorkerCrashedError
     except ImportError:
         raise InputError("needs Ray; pip install -e '.[ray]' in gripmon's checkout", "engine") from None
     if not ray.is_initialized():
         try:
             ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise InputError(
-                f"no Ray cluster at {address or 'this machine'} ({one_line(error):.200})", "address"
-            ) from None
+            where = address or "this machine"
+            raise InputError(f"no Ray cluster at {where} ({one_line(error):.200})", "address") from None
     environment = {"env_vars": dict.fromkeys(_ONE_THREAD, "1")}
-    task: Any = ray.remote(num_cpus=1, max_calls=WORKER_EPISODES, max_retries=_RAY_TRIES - 1, runtime_env=environment)(
-        _on_ray
-    )
-    shared = ray.put((configs, lens))
-    waiting, flying = deque(episodes), dict[Any, Episode]()
+    task: Any = ray.remote(
+        num_cpus=1, max_calls=WORKER_EPISODES, max_retries=_RAY_TRIES - 1, runtime_env=environment
+    )(_on_ray)
     resources: Any = ray.cluster_resources
-    while waiting or flying:
-        most = AHEAD * max(int(resources().get("CPU", 1)), 1)
-        while waiting and len(flying) < most:
-            episode = waiting.popleft()
-            flying[task.remote(shared, episode)] = episode
-        for done in ray.wait(list(flying), num_returns=1)[0]:
-            episode = flying.pop(done)
-            try:
-                yield ray.get(done)
-            except ray.exceptions.RayError:
-                yield failed(configs, episode, DIED)
+    waiting, flying = deque(episodes), dict[Any, Episode]()
+    try:
+        shared = ray.put(config)
+        while waiting or flying:
+            most = _RAY_AHEAD * max(int(resources().get("CPU", 1)), 1)
+            while waiting and len(flying) < most:
+                episode = waiting.popleft()
+                flying[task.remote(shared, episode, lens)] = episode
+            for done in ray.wait(list(flying), num_returns=1)[0]:
+                episode = flying.pop(done)
+                try:
+                    rows = ray.get(done)
+                except (WorkerCrashedError, OutOfMemoryError):
+                    rows = failed(config, episode, DIED)
+                yield episode, rows
+    except RayError as error:
+        right = "every node needs the same gripmon; what was measured is kept, call again"
+        raise InputError(f"the Ray cluster failed ({one_line(error):.300}); {right}", "engine") from None
 
 
-def _on_ray(given: tuple[Configs, str], episode: Episode) -> Measured:
-    _begin(*given)
-    return _work(episode)
+def _on_ray(config: Config, episode: Episode, lens: str) -> Rows:
+    import cv2
+
+    cv2.setNumThreads(1)
+    return measure(config, episode, lens)

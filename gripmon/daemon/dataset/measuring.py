@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 
-from gripmon.analyse.dataset import Measured
-from gripmon.analyse.stretches import stretches_of
+from gripmon.analyse.stretches import Stretch, stretches_of
 from gripmon.daemon.api import Monitor
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.checks import view_fault
-from gripmon.daemon.dataset.fitting import chosen, fit_of, spread
-from gripmon.io.sources import FolderSettings, Source, SourceError, VideoSettings, open_source
+from gripmon.daemon.overlay import outlines_of, overlay
+from gripmon.io.sources import FolderSettings, OpenedSource, Source, SourceError, VideoSettings, open_source
 from gripmon.io.sources.episodes import Episode
 from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.references import CommandRefused
 from gripmon.model.camera import make_camera
 from gripmon.model.errors import in_short
+from gripmon.model.geometry import from_record
 from gripmon.model.records import (
     Alert,
     Command,
@@ -28,25 +28,20 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Image,
-    MeasurementTrace,
     ReferenceRecord,
     Verdict,
 )
 from gripmon.record.table import FrameTable, TableBuilder
 
 PICTURE_WIDTH_PX = 320
-"""Width of thumbnails of about 8 kB, in which fingertips are recognisable; 390,000 take 3 GB."""
-_JPEG_QUALITY = 75
+"""Width of thumbnails of about 18 kB, in which fingertips are recognisable; 390,000 take 7 GB."""
 
-Pictured = tuple[Image, MeasurementTrace]
-Configs = tuple[Config, ...]
-"""One configuration per possible gripper file, otherwise equal."""
+Pictured = tuple[Image, FrameRecord]
+Rows = tuple[Stretch, ...]
 
 
-def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
-    """An episode's stretches; ``fault`` says what is wrong with it.  Never raises.
-
-    Uses the one of ``configs`` whose gripper the episode shows; there is no result if several or none of them fit.
+def measure(config: Config, episode: Episode, lens: str = "file") -> Rows:
+    """The rows of an episode: its stretches, or a single one that says what is wrong with it.  Never raises.
 
     The episode gets its own reference: the monitor is commanded to recalibrate with its first measured frame, and
     starts again from the new reference; if it isn't recalibrated, or only after a motion, the configuration's reference
@@ -54,16 +49,16 @@ def measure(configs: Configs, episode: Episode, lens: str = "file") -> Measured:
     configuration's in any case.
     """
     try:
-        return _measured(configs, episode, lens)
+        return _measured(config, episode, lens)
     except SourceError as error:
-        return failed(configs, episode, str(error))
+        return failed(config, episode, str(error))
     except Exception as error:  # noqa: BLE001  one bad episode must not stop the others
-        return failed(configs, episode, in_short(error))
+        return failed(config, episode, in_short(error))
 
 
-def failed(configs: Configs, episode: Episode, fault: str) -> Measured:
-    """The result for an episode that can't be measured."""
-    return Measured(episode.name, _camera(configs[0], episode), episode.key, episode.version, fault=fault)
+def failed(config: Config, episode: Episode, fault: str) -> Rows:
+    """The row of an episode that can't be measured."""
+    return (Stretch(episode=episode.name, camera=_camera(config, episode), reason=fault),)
 
 
 def _camera(config: Config, episode: Episode, source: Source | None = None) -> str:
@@ -73,59 +68,44 @@ def _camera(config: Config, episode: Episode, source: Source | None = None) -> s
     return str(getattr(source, "topic", None) or episode.source.camera or "unknown")
 
 
-def _measured(configs: Configs, episode: Episode, lens: str) -> Measured:
+def _measured(config: Config, episode: Episode, lens: str) -> Rows:
     source = open_source(episode.source)
-    camera = _camera(configs[0], episode, source)
+    camera = _camera(config, episode, source)
     from_file = getattr(source, "camera", None) if lens == "file" else None
     if from_file is not None:
-        configs = tuple(
-            dataclasses.replace(
-                one, settings=msgspec.structs.replace(one.settings, camera=from_file), camera=make_camera(from_file)
-            )
-            for one in configs
-        )
-    config = configs[0]
-    if len(configs) > 1:
-        frames = spread(_frames(source))
-        found = chosen([fit_of(one, frames) for one in configs])
-        if isinstance(found, str):
-            return Measured(episode.name, camera, episode.key, episode.version, fault=found)
-        config, source = configs[found], open_source(episode.source)
-    elif from_file is not None and (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
-        raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
-    run, coming, own = _Run(config), _frames(source), False
-    renewed = run.until_renewed(coming)
-    if renewed is not None:
-        anew = _Run(dataclasses.replace(config, reference=renewed)).whole(_frames(open_source(episode.source)))
-        own = anew.began_at_reference
-        run = anew if own else run.whole(coming)  # a reference of after a motion doesn't fit what was before
-    source.close()
+        settings = msgspec.structs.replace(config.settings, camera=from_file)
+        config = dataclasses.replace(config, settings=settings, camera=make_camera(from_file))
+        if (fault := view_fault(config.view(), config.gripper, config.camera)) is not None:
+            raise SourceError(f"{fault.key}: with the file's camera {fault.wrong}; {fault.right}")
+    run, own = _Run(config), False
+    with OpenedSource(source) as frames:
+        coming = iter(frames)
+        renewed = run.until_renewed(coming)
+        if renewed is not None:
+            with OpenedSource(open_source(episode.source)) as again:
+                anew = _Run(dataclasses.replace(config, reference=renewed)).whole(again)
+            own = anew.began_at_reference
+            run = anew if own else run.whole(coming)  # a reference of after a motion doesn't fit what was before
     table = run.table()
-    plain = Measured(
-        episode.name, camera, episode.key, episode.version, frames=len(table), own_reference=own,
-        gripper=config.gripper_path.stem, lens="configuration" if from_file is None else "file",
-    )  # fmt: skip
+    plain: dict[str, Any] = {
+        "episode": episode.name, "camera": camera, "own_reference": own, "gripper": config.gripper_path.stem,
+        "lens": "configuration" if from_file is None else "file",
+    }  # fmt: skip
     try:
-        stretches = tuple(stretches_of(table, run.alerts, run.reasons, config.settings.monitor.policy))
+        rows = stretches_of(table, run.alerts, run.reasons, config.settings.monitor.policy)
     except ValueError as error:
         why = Counter(reason for reason in run.reasons if reason).most_common(1)
-        return msgspec.structs.replace(plain, fault=f"{error}{f' ({why[0][1]} times: {why[0][0]})' if why else ''}")
-    return msgspec.structs.replace(plain, stretches=stretches, pictures=run.pictures(len(stretches)))
-
-
-def _frames(source: Source) -> Iterator[Frame]:
-    try:
-        while isinstance(frame := source.read(), Frame):
-            yield frame
-    finally:
-        source.close()
+        reason = f"{error}{f' ({why[0][1]} times: {why[0][0]})' if why else ''}"
+        return (Stretch(**plain, frames=len(table), reason=reason),)
+    shown = run.pictures(len(rows))
+    return tuple(msgspec.structs.replace(row, **plain, picture=shown.get(row.stretch)) for row in rows)
 
 
 class _Run:
     """A monitor's run over an episode, with memory for one table row per frame."""
 
     def __init__(self, config: Config) -> None:
-        self._monitor, self._builder = Monitor(config), TableBuilder()
+        self._config, self._monitor, self._builder = config, Monitor(config), TableBuilder()
         self.alerts: list[tuple[int, Alert]] = []
         self.reasons: list[str | None] = []
         self.began_at_reference = True
@@ -151,7 +131,7 @@ class _Run:
                 return self._monitor.reference
         return None
 
-    def whole(self, frames: Iterator[Frame]) -> _Run:
+    def whole(self, frames: Iterable[Frame]) -> _Run:
         """The run after all of ``frames``."""
         for frame in frames:
             self.process(frame)
@@ -163,36 +143,21 @@ class _Run:
         self._builder.add(record)
         self.alerts += [(record.stamp_ns, alert) for alert in record.alerts]
         self.reasons.append(record.reason)
-        if record.verdict is Verdict.VALID and frame.image is not None and (trace := self._monitor.trace()) is not None:
-            self._first = self._first or (frame.image, trace)
-            self._last = frame.image, trace
+        if record.verdict is Verdict.VALID and frame.image is not None:
+            self._last = frame.image, record
+            self._first = self._first or self._last
         return record
 
     def table(self) -> FrameTable:
         return TableBuilder.join([self._builder])
 
-    def pictures(self, stretches: int) -> tuple[bytes, ...]:
-        """JPEGs of the first valid frame and, if the camera moved, of the last."""
-        shown = [self._first, self._last] if stretches > 1 else [self._first]
-        return tuple(_drawn(*each) for each in shown if each is not None)
+    def pictures(self, stretches: int) -> dict[int, bytes]:
+        """JPEGs by number of the stretch: the first valid frame and, if the camera moved, the last."""
+        shown = {0: self._first} | ({stretches - 1: self._last} if stretches > 1 else {})
+        return {number: self._drawn(*each) for number, each in shown.items() if each is not None}
 
-
-def _drawn(image: Image, trace: MeasurementTrace) -> bytes:
-    """A small JPEG with the predicted edges (blue) and the edge points that were used (green)."""
-    import cv2
-    import numpy as np
-
-    shift, scale = 4, PICTURE_WIDTH_PX / image.shape[1]
-    grey: Any = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    if grey.dtype != np.uint8:
-        grey = (255.0 * (grey / grey.max())).astype(np.uint8)
-    canvas = cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-
-    def placed(points: Any) -> Any:
-        return np.round(((np.asarray(points) + 0.5) * scale - 0.5) * (1 << shift)).astype(np.int32)
-
-    for edge in trace.predicted_edges_uv_px:
-        cv2.polylines(canvas, [placed(edge)[:, None]], False, (255, 120, 40), 1, cv2.LINE_AA, shift)
-    for point in placed(trace.edge_uv_px[trace.edge_used]).tolist():
-        cv2.circle(canvas, point, 1 << (shift - 1), (60, 220, 60), -1, cv2.LINE_AA, shift)
-    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes())
+    def _drawn(self, image: Image, record: FrameRecord) -> bytes:
+        assert record.measured_T is not None, "a valid frame has a transform"
+        cam_T_grip, opening_m = from_record(record.measured_T), record.jaw_opening_m
+        outlines = outlines_of(self._config.camera, self._config.gripper, cam_T_grip, opening_m)
+        return overlay(image, record, outlines, PICTURE_WIDTH_PX)

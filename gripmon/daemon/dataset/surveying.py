@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
 from gripmon import __version__
-from gripmon.analyse.dataset import Journal, Rows, Written, write_dataset
-from gripmon.analyse.dataset_annotations import Annotations
+from gripmon.analyse.dataset import REPORT, TABLE, Results, write_table
 from gripmon.analyse.dataset_page import write_page
-from gripmon.daemon.config import Config, load_config, read_gripper
-from gripmon.daemon.dataset.engines import local, ray_cluster
-from gripmon.daemon.dataset.measuring import Configs
+from gripmon.analyse.stretches import POSE_COLUMNS
+from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.dataset.engines import ENGINES, local, on_ray
 from gripmon.daemon.replaying import as_configured
 from gripmon.io.sources import BagSettings, LeRobotSettings
 from gripmon.io.sources.episodes import Episode, find_episodes, hash_of
@@ -26,15 +26,13 @@ from gripmon.model.records import to_json
 
 @dataclass(frozen=True)
 class Survey:
-    """The files ``written``, the number of episodes, how many were ``measured`` now, and how many failed."""
+    """The files written, the number of episodes, how many were ``measured`` now, and how many have no transform."""
 
-    written: Written
+    table: Path
+    report: Path
     episodes: int
     measured: int
-
-    @property
-    def failed(self) -> int:
-        return self.written.failed
+    failed: int
 
 
 def measure_dataset(
@@ -50,54 +48,43 @@ def measure_dataset(
     level: float = 0.01,
     tolerance_m: float = 0.0,
     tolerance_rad: float = 0.0,
-    annotate: str | Path | None = None,
-    grippers: Sequence[str | Path] = (),
     step: Callable[[int], None] = lambda _total: None,
 ) -> Survey:
     """Measure every episode of a folder or URL with each of its ``cameras`` (topics, features), and write the table and
     the report to the folder ``out``.  The dataset is only read.
 
     ``config``: the gripper, a camera, a rough reference, and in its source how the jaw opening follows from the state.
-    ``level`` and the tolerances: see :func:`gripmon.analyse.stretches.mountings_of`.  ``workers``: number of processes
-    (None: one per core).  ``annotate``: a folder or URL for the results in the dataset's own format, see
-    :class:`gripmon.analyse.dataset_annotations.Annotations`.  ``grippers``: files in addition to the configuration's;
-    each episode is measured with the one that its frames show, and fails if none or several fit
-    (:func:`gripmon.daemon.dataset.fitting.chosen`).  ``step`` is called with the number of episodes after each one.
+    ``level`` and the tolerances: see :func:`gripmon.analyse.dataset.mountings_of`.  ``workers``: number of processes
+    (None: one per core).  ``step`` is called with the number of episodes after each one.
     Called again with the same ``out``, it measures what is new, has changed or was interrupted.
 
-    Raises :class:`InputError`: nothing to measure, several cameras without a choice, an ``out`` with results of another
-    configuration, an engine that isn't available.
+    Raises :class:`InputError`: nothing to measure, several cameras without a choice, an ``out`` that can't be written
+    or has results of another configuration, an engine that isn't available.
     """
+    if engine not in ENGINES:
+        raise InputError(f"{engine!r} is none; {' or '.join(ENGINES)}", "engine")
+    if workers is not None and workers < 1:
+        raise InputError(f"{workers} isn't a number of processes; 1 or more", "workers")
     config = config if isinstance(config, Config) else load_config(config, check_source=False)
-    # The taught model belongs to the configuration's own gripper.
-    others = (
-        replace(config, gripper=read_gripper(path), gripper_path=path, taught=None) for path in map(Path, grippers)
-    )
-    configs = (config, *others)
-    if len({one.gripper_path.stem for one in configs}) < len(configs):
-        raise InputError("two files of one name, or the configuration's own again; each file once", "gripper")
     episodes = [_configured(episode, config) for episode in find_episodes(str(dataset), cameras)]
-    annotations = None if annotate is None else Annotations(episodes, str(annotate))
     folder = writable_folder(Path(out))
-    with Journal(folder, _fingerprint(configs, lens)) as journal:
-        versions = {episode.key: episode.version for episode in episodes}
-        journal.keep(versions)
-        left = [episode for episode in episodes if episode.key not in journal]
+    with Results(folder, _fingerprint(config, lens)) as results:
+        left = [episode for episode in episodes if episode not in results]
         for _ in range(len(episodes) - len(left)):
             step(len(episodes))
         if engine == "ray":
-            results = ray_cluster(configs, left, lens, address)
+            measured = on_ray(config, left, lens, address)
         else:
-            results = local(configs, left, lens, workers or len(os.sched_getaffinity(0)))
-        for measured in results if left else ():
-            journal.add(measured)
-            step(len(episodes))
-        order = [episode.key for episode in episodes]
-        written = write_dataset(journal, order, folder, level, tolerance_m, tolerance_rad)
-        write_page(written, journal, str(dataset))
-        if annotations is not None:
-            annotations.write(Rows(journal, written))
-    return Survey(written, len(episodes), len(left))
+            measured = local(config, left, lens, workers or len(os.sched_getaffinity(0)))
+        with contextlib.closing(measured):
+            for episode, rows in measured:
+                results.add(episode, rows)
+                step(len(episodes))
+        table = write_table(results, episodes, folder, level, tolerance_m, tolerance_rad)
+        write_page(folder / REPORT, table, results, episodes, str(dataset))
+    known = table.filter(table[POSE_COLUMNS[0]].is_valid()).group_by(["episode", "camera"]).aggregate([])
+    failed = len(episodes) - len(known)
+    return Survey(folder / TABLE, folder / REPORT, len(episodes), len(left), failed)
 
 
 def _configured(episode: Episode, config: Config) -> Episode:
@@ -109,12 +96,10 @@ def _configured(episode: Episode, config: Config) -> Episode:
     return msgspec.structs.replace(episode, source=settings)
 
 
-def _fingerprint(configs: Configs, lens: str) -> str:
+def _fingerprint(config: Config, lens: str) -> str:
     """A hash of everything on which a result depends besides the episode."""
-    config = configs[0]
     settings = config.settings
     opening = getattr(settings.source, "opening", None)
-    parts = [settings.camera, settings.monitor, settings.jaw, opening, config.reference]
-    parts += [one.gripper.model for one in configs]
+    parts = [settings.camera, settings.monitor, settings.jaw, opening, config.reference, config.gripper.model]
     taught = "" if config.taught is None else to_json(config.taught)
     return hash_of([__version__, lens, taught, *(msgspec.json.encode(part) for part in parts)])
