@@ -294,18 +294,10 @@ def _find_tls_files(config: zenoh.Config, path: Path) -> None:
             continue
         file = path.parent / value
         if not file.is_file():
-            raise ZenohFileError(f"{path}: {key}: no file {file}; {_remedy(name, file)}")
+            raise ZenohFileError(f"{path}: {key}: no file {file}; docs/howto/security.md shows how to make it")
         if name in _SECRETS and file.stat().st_mode & 0o077:
             raise ZenohFileError(f"{path}: {key}: others may read {file}; chmod 600 {file}")
         config.insert_json5(key, _json(str(file.resolve())))
-
-
-def _remedy(name: str, file: Path) -> str:
-    """How to get a missing certificate or key: a second authority would not help."""
-    if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
-        host = " --host ADDRESS" if name.startswith("listen") else ""
-        return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
-    return "copy it from where the certificates were made (by gripmon certificates, once for all machines)"
 
 
 def _json(value: str) -> str:
@@ -395,9 +387,7 @@ def endpoints_fault(config: zenoh.Config) -> tuple[str, str] | None:
                 return which, fault
     for endpoint in endpoints(config, "listen"):
         if endpoint.partition("/")[0] in _WITH_CERTIFICATE and not _has_certificate(config):
-            right = (
-                f"listen_certificate and listen_private_key of {_TLS} in a file of Zenoh's (see gripmon certificates)"
-            )
+            right = f"listen_certificate and listen_private_key of {_TLS} in a file of Zenoh's"
             return "listen", f"{endpoint} needs a certificate; {right}"
     return None
 
