@@ -42,7 +42,9 @@ def opened(path: str) -> IO[bytes]:
     """A file to read and to seek in.  Raises :class:`SourceError`."""
     try:
         if "://" not in path:
-            return Path(path).open("rb")
+            if (local := Path(path)).exists() and not local.is_file():  # a pipe or a device might never end
+                raise SourceError(f"path: {path} is not a regular file; one")
+            return local.open("rb")
         system, inside = file_system(path)
         found: IO[bytes] = system.open(inside, "rb")
         return found
