@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image as PilImage
-from support.episode_files import NS, STORE, Shots, write_mcap, write_rosbag2
+from support.episode_files import NS, STORE, Shots, write_mcap, write_rosbag2, write_video
 from test_episode_sources import BEGIN_NS, FINGERS, LENS, frames_of, shots
 
 from gripmon.calibrate.formats import read_ros
-from gripmon.io.sources import BagSettings, FolderSettings, SourceError, settings_for_path
+from gripmon.io.sources import BagSettings, FolderSettings, SourceError, VideoSettings, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.io.sources.stamps import JUMP_NS, Stamped, rising
 from gripmon.model.camera import LensSettings, make_camera
@@ -179,6 +180,20 @@ def test_pictures_are_as_the_sensor_has_them_in_every_container(tmp_path: Path, 
     in_message = source.read()
     assert np.array_equal(in_folder.image, in_message.image) and in_message.image.shape == image.shape
     assert np.abs(in_message.image.astype(float) - image).mean() < 3.0
+
+
+def test_a_video_that_is_to_be_shown_upright_is_read_as_the_sensor_has_it(tmp_path: Path):
+    """A phone held upright writes a rotation into the track's header (ISO 14496-12, tkhd)."""
+    image = np.zeros((48, 64), np.uint8)
+    image[:24, :32] = 200
+    write_video(tmp_path / "a.mp4", [image] * 3, 10, "libx264")
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40  # version 0: the matrix is 40 bytes after the name
+    assert struct.unpack(">9i", data[matrix : matrix + 36])[::4] == (1 << 16, 1 << 16, 1 << 30)
+    data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    (tmp_path / "a.mp4").write_bytes(data)
+    first, *_ = frames_of(VideoSettings(path=str(tmp_path / "a.mp4")))
+    assert np.abs(first.image[:, :, 0].astype(float) - image).mean() < 3.0
 
 
 @pytest.mark.parametrize(
