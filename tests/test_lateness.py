@@ -74,6 +74,17 @@ def test_a_clock_that_was_set_back_is_told_by_its_stamps(step_s: float):
     assert min(said[503:]) == pytest.approx(0.2) == max(said[503:])
 
 
+@pytest.mark.parametrize("wrong_s", [86_400.0, 1.0, -1.0, -86_400.0])
+@pytest.mark.parametrize("frame", [0, 300])
+def test_one_wrong_stamp_tells_nothing_of_the_others(wrong_s: float, frame: int):
+    """In a delay that lasts it doesn't make it forgotten; as the first one it costs some frames."""
+    way_s, wrong = (lambda at_s: 0.005 + 2.5 * (at_s >= 20)), (lambda at_s: wrong_s * (at_s == frame / 10))
+    said, _ = series(way_s, wrong, seconds=600)
+    assert said[frame + 5 : 200] == pytest.approx([0.0] * len(said[frame + 5 : 200]))
+    others = [each for k, each in enumerate(said[200:], 200) if k != frame]
+    assert others == pytest.approx([2.5] * len(others))
+
+
 def test_frames_that_overtake_each_other_set_no_clock():
     lateness = Lateness()
     for k in range(600):

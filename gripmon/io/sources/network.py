@@ -327,9 +327,12 @@ WINDOW_S = 60.0
 """Delays are compared by the fastest frame of each window: long enough to contain one without a queue before it (s)."""
 
 SURE_FRAMES = 3
-"""Frames in a row with stamps below an earlier one, after which the driver's clock was set back: frames that overtook
-each other have the next one above it.
+"""Frames in a row with stamps below an earlier one, or ahead of all before, from which on the driver's clock was set:
+of frames that overtook each other the next one is above it, and one wrong stamp has right ones after it.
 """
+
+_AHEAD_NS = 100_000_000
+"""A frame that is faster than all before by more than this has to be confirmed by others."""
 
 _FAR_NS = 2**63
 
@@ -347,8 +350,9 @@ class Lateness:
         self._smallest_ns = _FAR_NS
         self._window_ns = self._before_ns = _FAR_NS  # the smallest of this window and of the one before
         self._window_ends_ns: int | None = None
-        self._latest_stamp_ns = self._late_ns = -_FAR_NS  # the latest stamp, and how late its frame was
-        self._below = 0  # frames in a row with earlier stamps
+        self._latest_stamp_ns = -_FAR_NS
+        self._late_ns = (-_FAR_NS, -_FAR_NS)  # how late the frame with the latest stamp was, and the one before it
+        self._below = self._ahead = 0  # frames in a row with earlier stamps; that are faster than all before
         self._of_this_time = False
 
     @property
@@ -361,6 +365,9 @@ class Lateness:
     def waited_ns(self, stamp_ns: int, arrived_ns: int, unix_ns: int) -> int:
         """``arrived_ns`` by the monotonic clock, ``unix_ns`` the same by this machine's clock."""
         late_ns = arrived_ns - stamp_ns
+        self._ahead = self._ahead + 1 if late_ns < self._smallest_ns - _AHEAD_NS and self._smallest_ns < _FAR_NS else 0
+        if 0 < self._ahead < SURE_FRAMES:
+            return 0
         self._follow_the_clock(stamp_ns, late_ns)
         if self._window_ends_ns is None or arrived_ns >= self._window_ends_ns:
             self._follow_the_drift()
@@ -374,15 +381,15 @@ class Lateness:
 
     def _follow_the_clock(self, stamp_ns: int, late_ns: int) -> None:
         """No link makes stamps go back, except for frames that overtake each other."""
-        if stamp_ns > self._latest_stamp_ns:
-            self._latest_stamp_ns, self._late_ns, self._below = stamp_ns, late_ns, 0
-        elif stamp_ns < self._latest_stamp_ns:
+        if stamp_ns < self._latest_stamp_ns:
             self._below += 1
-        if self._below == SURE_FRAMES:
-            step_ns = late_ns - self._late_ns
-            self._smallest_ns += step_ns
+            if self._below < SURE_FRAMES:
+                return
+            # By the slower one of both: the latest stamp may be the wrong one, and a delay is forgotten by nothing.
+            self._smallest_ns += max(late_ns - max(self._late_ns), 0)
             self._window_ns = self._before_ns = _FAR_NS
-            self._latest_stamp_ns, self._late_ns, self._below = stamp_ns, late_ns, 0
+            self._late_ns = (late_ns, late_ns)
+        self._latest_stamp_ns, self._late_ns, self._below = stamp_ns, (late_ns, self._late_ns[0]), 0
 
     def _follow_the_drift(self) -> None:
         """At a window's end."""
