@@ -14,7 +14,6 @@ from gripmon.model.atomic import opened_atomically, write_atomically
 PACKAGE = Path(__file__).resolve().parent.parent / "gripmon"
 OTHERWISE = {
     "model/atomic.py",
-    "io/wire/certificates.py",  # keys, which nobody else may read for a moment
     "daemon/estimates.py",  # lines, as they come
     "cli/alert_log.py",
     "analyse/dataset.py",  # a temporary file that is renamed, and one that is only locked

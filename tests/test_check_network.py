@@ -40,10 +40,8 @@ def refused(path: str, capsys: pytest.CaptureFixture[str]) -> str:
     [
         ({"zenoh_config": "nothing.json5"}, "publish.zenoh_config: no file "),
         ({"zenoh_config": "tls.json5"}, "gone.pem"),
-        ({"zenoh_config": "port.json5"}, "port.json5: connect/endpoints: tcp/127.0.0.1:70000: 70000 can't be a port"),
-        ({"listen": ["tcp/127.0.0.1:99999"]}, "publish.listen: tcp/127.0.0.1:99999: 99999 can't be a port; a whole"),
-        ({"connect": ["tcp/10.0.0.5"]}, "publish.connect: tcp/10.0.0.5 has no port; host and port, e.g. tcp/127"),
-        ({"listen": ["tls/127.0.0.1:7447"]}, "publish.listen: tls/127.0.0.1:7447 needs a certificate; "),
+        ({"listen": ["tcp/127.0.0.1:99999"]}, "publish.listen: 'tcp/127.0.0.1:99999' is not an endpoint; "),
+        ({"connect": ["tcp/10.0.0.5"]}, "publish.connect"),
         ({"mode": "client"}, "publish.connect: a client needs a router; "),
     ],
 )
@@ -51,27 +49,27 @@ def test_a_session_that_cannot_be_opened(
     publish: dict[str, object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     (tmp_path / "tls.json5").write_text(TLS_FILE)
-    (tmp_path / "port.json5").write_text('{connect: {endpoints: ["tcp/127.0.0.1:70000"]}}')
     assert said in refused(written(tmp_path, publish=publish), capsys)
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "wrong"),
+    ("endpoint", "right"),
     [
-        ("tcp/127.0.0.1:7447", ""),
-        ("tcp/[::1]:7447#iface=lo", ""),
-        ("udp/robot.local:65535?rel=0", ""),
-        ("serial//dev/ttyS0#baudrate=9600", ""),
-        ("unixsock-stream//tmp/a", ""),
-        ("tcp/[::1]", "has no port"),
-        ("tcp/:7447", "has no host"),
-        ("ws/a:x", "x can't be a port"),
-        ("tcp/a:", "nothing can't be a port"),
-        ("tcp/a:0", "0 can't be a port"),
-        ("tcp/a:123456789012", "can't be a port"),
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.0.0.1:0", True),  # any port that is free
+        ("tcp/[::1]:7447#iface=lo", True),
+        ("udp/robot.local:65535?rel=0", True),
+        ("serial//dev/ttyS0#baudrate=9600", True),
+        ("unixsock-stream//tmp/a", True),
+        ("nonsense", False),
+        ("tcp/[::1]", False),
+        ("tcp/:7447", False),
+        ("ws/a:x", False),
+        ("tcp/a:", False),
+        ("tcp/a:65536", False),
+        ("tcp/a:123456789012", False),
+        ("tcp/a:1\n", False),
     ],
 )
-def test_endpoints(endpoint: str, wrong: str):
-    fault = endpoint_fault(endpoint)
-    assert wrong in fault if wrong else not fault
-    assert not endpoint_fault("tcp/127.0.0.1:0", listens=True), "any port that is free"
+def test_endpoints(endpoint: str, right: bool):
+    assert endpoint_fault(endpoint) == "" if right else " is not an endpoint; " in endpoint_fault(endpoint)

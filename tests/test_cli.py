@@ -36,7 +36,6 @@ COMMANDS = (
     "simulate",
     "check",
     "teach",
-    "certificates",
 )
 
 

@@ -136,7 +136,7 @@ def test_bad_names_are_refused(names: tuple[str, str | None]):
 
 
 def test_a_bad_endpoint_is_refused():
-    with pytest.raises(PublishError, match=r"^connect: 'nonsense' is not an endpoint; protocol/address, e.g. tcp/"):
+    with pytest.raises(PublishError, match=r"^connect: 'nonsense' is not an endpoint; protocol/host:port, e.g. tcp/"):
         TransformClient("arm", connect=["nonsense"])
 
 
@@ -144,5 +144,5 @@ def test_a_text_is_one_endpoint():
     endpoint = free_endpoint()
     with plain_session(listen=endpoint, mode="peer") as other, TransformClient("arm", "wrist", connect=endpoint):
         wait_until(lambda: list(other.info.peers_zid()), "the connection")
-    with pytest.raises(PublishError, match=r"^connect: tcp/127.0.0.1:70000: 70000 can't be a port; a whole"):
+    with pytest.raises(PublishError, match=r"^connect: 'tcp/127.0.0.1:70000' is not an endpoint; "):
         TransformClient("arm", connect="tcp/127.0.0.1:70000")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
 
 import msgspec
@@ -173,8 +175,57 @@ def test_format_of_tomorrow_is_refused(tmp_path: Path):
     write_lerobot(tmp_path / "set", [shots(2)], fps=10)
     info = tmp_path / "set" / "meta" / "info.json"
     info.write_text(info.read_text().replace("v3.0", "v4.0"))
-    with pytest.raises(SourceError, match=r"format v4\.0; v2\.0, v2\.1 or v3\.0"):
+    with pytest.raises(SourceError, match=r"format v4\.0; v2\.1 or v3\.0"):
         open_source(LeRobotSettings(path=str(tmp_path / "set")))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"data_path": "../secret"}, "data_path: '../secret' leads out of it"),
+        ({"data_path": "/etc/passwd"}, "data_path: '/etc/passwd' leads out of it"),
+        ({"data_path": "http://127.0.0.1:9/stolen"}, "leads out of it"),
+        ({"data_path": "{episode_index:2147483647}"}, "{episode_index} of width 2147483647"),
+        ({"data_path": "{episode_index:0999d}"}, "of width 0999d; a path of"),
+        ({"data_path": "{evil}"}, "data_path: {evil} of width any"),
+        ({"data_path": "{episode_index.__class__}"}, "{episode_index.__class__} of width any"),
+        ({"data_path": "{episode_index!r}"}, "data_path: "),
+        ({"data_path": "{"}, "data_path: "),
+        ({"data_path": [1]}, "isn't a LeRobot dataset (Expected `str`"),
+        ({"data_path": "pipe"}, "is not a regular file"),
+        ({"video_path": "{video_key}/../../x"}, "leads out of it"),
+        ({"video_path": None}, "video_path: "),
+        ({"chunks_size": 0}, "isn't a LeRobot dataset (Expected `int` >= 1"),
+        ({"fps": 0}, "isn't a LeRobot dataset (Expected `float` > 0"),
+        ({"features": [1, 2]}, "isn't a LeRobot dataset (Expected `object`"),
+        ({"features": {WRIST: {}}}, "isn't a LeRobot dataset (Object missing required field `dtype`"),
+        ({"features": {"../../x": {"dtype": "video"}}}, "video_path: 'videos/chunk-000/../../x/"),
+        ("[" * 100_000, "isn't a LeRobot dataset ("),
+        ('{"codebase_version": NaN}', "isn't a LeRobot dataset ("),
+        (["episodes", '{"length": 5}'], "isn't a LeRobot dataset (Object missing required field `episode_index`"),
+        (["episodes", '{"episode_index": -1}'], "isn't a LeRobot dataset ("),
+        (["episodes", '{"episode_index": %s}' % ("9" * 5000)], "isn't a LeRobot dataset ("),
+        (["episodes", "[1]"], "isn't a LeRobot dataset ("),
+    ],
+)  # fmt: skip
+def test_a_dataset_of_a_stranger_is_read_inside_itself_or_refused_in_one_line(tmp_path: Path, change, words: str):
+    """Its description may say anything; what it says of paths and numbers is checked before it is used."""
+    root = tmp_path / "set"
+    write_lerobot(root, [shots(3)], fps=10, version="v2.1", codec="libx264")
+    (tmp_path / "secret").write_text("kept")
+    os.mkfifo(root / "pipe")
+    info = root / "meta" / "info.json"
+    if isinstance(change, dict):
+        info.write_text(json.dumps(json.loads(info.read_text()) | change))
+    elif isinstance(change, str):
+        info.write_text(change)
+    else:
+        (root / "meta" / "episodes.jsonl").write_text(change[1])
+    try:
+        fault = str(frames_of(LeRobotSettings(path=str(root)))[-1].fault)
+    except SourceError as error:
+        fault = str(error)
+    assert words in fault and "\n" not in fault and "secret can" not in fault
 
 
 def test_from_a_store_of_objects(tmp_path: Path):

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zenoh
+from support.certificates import add_robot, make_certificates
 from support.loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
 from support.published import Published
 from support.router_process import ROOT, RouterProcess, running
 
-from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.io.wire import PublishSettings
 from gripmon.io.wire.session import load_file, value_of
@@ -37,11 +38,9 @@ class Fleet:
             text = (folder / f"{name}.json5").read_text()
             text = text.replace(self.regional.partition("/")[2], self.central.partition("/")[2])
             (folder / f"central-{name}.json5").write_text(text)
-        robots = ["--robot", "arm", "--robot", "arm2", "--rules", str(folder / "regional.json5")]
-        assert main(["certificates", *robots, "--out", str(folder / "certificates")]) == 0
-        second = (folder / "monitor.json5").read_text().replace("monitor-arm", "monitor-arm2")
-        (folder / "monitor-arm2.json5").write_text(second)
-        assert main(["certificates", "central", "--host", "127.0.0.1", "--out", str(folder / "certificates")]) == 0
+        make_certificates(folder, "arm", "issue central serverAuth,clientAuth IP:127.0.0.1")
+        shutil.copy(folder / "monitor.json5", folder / "monitor-arm2.json5")
+        add_robot(folder, "arm", "arm2")
 
     def session(self, name: str) -> zenoh.Session:
         return zenoh.open(load_file(self.folder / f"{name}.json5"))

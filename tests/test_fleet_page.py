@@ -214,6 +214,24 @@ def test_a_picture_is_made_once_for_all_who_look(cell: Cell, monkeypatch: pytest
     assert green[40:180, 45:55].max() > 60 and green[215:].max() < 30
 
 
+@pytest.mark.parametrize(
+    ("size_px", "stated_px"),
+    [((8000, 8000), (64, 48)), ((8000, 8000), (8000, 8000)), ((4, 9000), (4, 9000)), ((64, 48), None)],
+    ids=["another size", "too large", "too thin", "none stated"],
+)
+def test_a_picture_of_another_size_than_the_monitors_is_not_decoded(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, size_px: tuple[int, int], stated_px: tuple[int, int] | None
+):
+    """A few kB may be gigabytes of pixels."""
+    data = cv2.imencode(".png", np.zeros(size_px[::-1], np.uint8))[1].tobytes()
+    image = None if stated_px is None else SnapshotImage("png", *stated_px, "mono8", len(data))
+    reply = CommandReply(CommandName.SNAPSHOT, True, "", "a", 3, None, Snapshot(frame_record(5), 0.1, None, image))
+    monkeypatch.setattr(cell.site._fleet, "send", lambda *_, **__: (reply, data))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(BadRequest, match=r"its image: .* pixels; |its newest frame has no image"):
+        cell.site.picture(ARM, cell.order("undo").monitor_id)
+
+
 def test_why_there_is_no_picture_is_said_and_not_asked_again_at_once(cell: Cell):
     cell.answers[CommandName.SNAPSHOT] = CommandReply(CommandName.SNAPSHOT, False, "no frame has come yet", "a", 3)
     identity = cell.order("undo").monitor_id

@@ -124,10 +124,9 @@ def test_close_frees_token_port_and_threads(endpoint: str):
 def test_a_port_that_is_taken_is_said_with_its_key(publisher: Published, endpoint: str):
     with pytest.raises(PublishError) as caught:
         Published(PublishSettings(listen=(endpoint,)), "arm", "other")
-    assert (
-        str(caught.value)
-        == f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
-    )
+    said = str(caught.value)
+    assert said.startswith("publish.listen: can't open a Zenoh session: ") and "\n" not in said
+    assert endpoint in said and "Address already in use" in said
 
 
 def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str):
@@ -178,7 +177,7 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
         publisher.event(state_record(5))
         with plain_session(connect=endpoint) as session:
             assert ask(session, f"{PREFIX}/state")[0]["seq"] == 5
-        with pytest.raises(PublishError, match=rf"^publish.zenoh_config: {endpoint} is already in use"):
+        with pytest.raises(PublishError, match=rf"^publish.zenoh_config: .*{endpoint}.*Address already in use"):
             Published(PublishSettings(zenoh_config=str(path)), "arm", "other")
     finally:
         publisher.close()
@@ -188,10 +187,10 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
     ("changes", "text"),
     [
         ({"mode": "client"}, "publish.connect: a client needs a router"),
-        ({"connect": ("nonsense",)}, "publish.connect: 'nonsense' is not an endpoint; protocol/address, e.g. tcp/"),
+        ({"connect": ("nonsense",)}, "publish.connect: 'nonsense' is not an endpoint; protocol/host:port, e.g. tcp/"),
         ({"connect": ("127.0.0.1:1",)}, "publish.connect: '127.0.0.1:1' is not an endpoint; "),
-        ({"connect": ("tcp/127.0.0.1",)}, "publish.connect: tcp/127.0.0.1 has no port; "),
-        ({"listen": ("tcp/[::1]:65536",)}, "publish.listen: tcp/[::1]:65536: 65536 can't be a port; "),
+        ({"connect": ("tcp/127.0.0.1",)}, "publish.connect: 'tcp/127.0.0.1' is not an endpoint; "),
+        ({"listen": ("tcp/[::1]:65536",)}, "publish.listen: 'tcp/[::1]:65536' is not an endpoint; "),
         ({"listen": ("tcp/[::1]:7447\n",)}, "publish.listen: 'tcp/[::1]:7447\\n' is not an endpoint; "),
         ({"zenoh_config": "/nowhere.json5"}, "publish.zenoh_config: no file /nowhere.json5"),
         ({"zenoh_config": __file__}, "publish.zenoh_config: "),

@@ -65,9 +65,8 @@ def test_a_port_in_use_is_said_in_one_line(tmp_path: Path, endpoint: str):
     config = configured(tmp_path, f"{{listen: [{endpoint}]}}")
     with plain_session(listen=endpoint, mode="peer"):
         line = refused(config)
-    assert line == (
-        f"{config}: publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
-    )
+    assert line.startswith(f"{config}: publish.listen: can't open a Zenoh session: ")
+    assert endpoint in line and "Address already in use" in line
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
+from support.certificates import add_robot, make_certificates
 from support.loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
 from support.published import Published
 from support.router_process import ROOT, running
@@ -61,18 +62,16 @@ def own_files(folder: Path, endpoint: str) -> None:
     for file in (ROOT / "configs" / "zenoh").glob("*.json5"):
         text = file.read_text().replace("arm1", "arm")
         folder.joinpath(file.name).write_text(text.replace("127.0.0.1:7447", endpoint.partition("/")[2]))
-    assert main(["certificates", "--robot", "arm", "--out", str(folder / "certificates")]) == 0
+    make_certificates(folder, "arm")
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     made = Site(tmp_path_factory.mktemp("site"), free_endpoint())
     own_files(made.folder, made.endpoint)
-    more = ["--robot", "arm2", "--rules", str(made.file("router")), "--out", str(made.folder / "certificates")]
-    assert main(["certificates", *more]) == 0
     for name in ("monitor", "robot"):
-        text = made.file(name).read_text()
-        made.file(f"{name}-arm2").write_text(text.replace(f"{name}-arm", f"{name}-arm2"))
+        shutil.copy(made.file(name), made.file(f"{name}-arm2"))
+    add_robot(made.folder, "arm", "arm2")
     with running(made.file("router"), made.endpoint):
         made.monitor = Published(
             PublishSettings(zenoh_config="monitor.json5"), relative_to=made.folder, identified=True
@@ -247,7 +246,7 @@ def test_a_robot_reads_nothing(site: Site):
 def stranger(site: Site, tmp_path: Path) -> Path:
     """The controller's file beside certificates that someone else has made."""
     shutil.copy(site.file("controller"), tmp_path)
-    assert main(["certificates", "--out", str(tmp_path / "certificates")]) == 0
+    make_certificates(tmp_path, "arm")
     return tmp_path
 
 
@@ -282,7 +281,7 @@ def test_no_tls_is_refused(site: Site, tmp_path: Path):
 
 def test_a_name_that_no_rule_knows_gets_nothing(site: Site):
     """The right authority, so the connection stands; and that is all."""
-    assert main(["certificates", "visitor", "--out", str(site.folder / "certificates")]) == 0
+    make_certificates(site.folder, "arm", "issue visitor clientAuth DNS:visitor.invalid")
     site.file("visitor").write_text(site.file("controller").read_text().replace("controller", "visitor"))
     with site.session("visitor") as visitor, site.session("controller") as controller:
         stolen: list[zenoh.Sample] = []
@@ -339,21 +338,3 @@ def test_two_monitors_are_seen_through_the_rules(site: Site):
     finally:
         second.close()
     wait_until(lambda: not site.monitor.presence.others(), "the first one to be alone again")
-
-
-def test_certificates_that_spoke_for_every_robot_go_on_with_the_lines_that_are_there(tmp_path: Path):
-    endpoint = free_endpoint()
-    own_files(tmp_path, endpoint)
-    assert main(["certificates", "monitor", "robot", "--out", str(tmp_path / "certificates")]) == 0
-    for name in ("monitor", "robot"):
-        text = (tmp_path / f"{name}.json5").read_text()
-        (tmp_path / f"{name}.json5").write_text(text.replace(f"{name}-arm", name))
-    router = tmp_path / "router.json5"
-    router.write_text(re.sub(r"(?m)^( +)// (?=[{ ].*[\[\]\",]$)", r"\1", router.read_text()))
-    with running(router, endpoint):
-        monitor = Published(PublishSettings(zenoh_config="monitor.json5"), "any", relative_to=tmp_path)
-        try:
-            with TransformClient("any", "wrist", zenoh_config_file=str(tmp_path / "controller.json5")) as client:
-                wait_until(lambda: monitor.transform(frame_record()) or client.latest().usable, "a transform")
-        finally:
-            monitor.close()

@@ -160,7 +160,8 @@ def read_mapping(file: str, data: bytes, right: str) -> dict[str, Any]:
 
 
 _ROS = "a camera_info file of ROS: image_width, camera_matrix, distortion_model, …"
-# OpenCV, which ROS passes them to, distinguishes models only by this count; REP 104 gives plumb_bob 5 and the other 8.
+# OpenCV, which ROS passes them to, distinguishes models only by this count; REP 104 gives plumb_bob 5 and the other 8,
+# and drivers fill up with zeros.
 _ROS_COUNTS = {
     "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8, 12, 14), "equidistant": (4,), "fisheye": (4,),
 }  # fmt: skip
@@ -184,8 +185,21 @@ def read_ros(data: bytes, file: str) -> LensSettings:
     right = "plumb_bob, rational_polynomial or equidistant"
     counts = values.choice("distortion_model", model, _ROS_COUNTS, right)
     right = f"of {model} {' or '.join(str(n) for n in counts if n)} values"
-    coefficients = flat.numbers("distortion_coefficients", counts, right)
+    held = flat.numbers("distortion_coefficients", tuple(range(15)), right)
+    coefficients = _without_zeros(held, counts)
+    if model == "plumb_bob" and len(coefficients) not in counts:  # as image_geometry reads it: by the count
+        counts = _ROS_COUNTS["rational_polynomial"]
+        coefficients = _without_zeros(held, counts)
+    if len(coefficients) not in counts:
+        raise flat.fault("distortion_coefficients", f"holds {len(held)} values", right)
     return values.camera((width, height), pinhole, coefficients, fisheye=model in ("equidistant", "fisheye"))
+
+
+def _without_zeros(coefficients: tuple[float, ...], counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Without trailing zeros, if they are more than a model can have."""
+    while len(coefficients) not in counts and coefficients and not coefficients[-1]:
+        coefficients = coefficients[:-1]
+    return coefficients
 
 
 def write_ros(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:

@@ -17,7 +17,6 @@ from gripmon.cli import (
     calibrate_intrinsics,
     calibrate_plane,
     calibrate_verify,
-    certificates,
     check,
     dataset,
     demo,
@@ -47,7 +46,7 @@ _METHODS = (
     calibrate_verify.verify, calibrate_exchange.import_, calibrate_exchange.export,
 )  # fmt: skip
 _WAYS = (gripper_cad.from_cad, gripper_images.from_images)
-_LAST = (setup.setup, setup.target, teach.teach, certificates.certificates)
+_LAST = (setup.setup, setup.target, teach.teach)
 
 _EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 

@@ -37,8 +37,7 @@ _FEED_EXAMPLES = """\
 exit codes: 0 all images sent; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
 
 _ROUTER_EXAMPLES = """\
-  gripmon certificates --out certificates              once: keys for everyone
-  gripmon router configs/zenoh/router.json5            mutual TLS and access rules
+  gripmon router configs/zenoh/router.json5            mutual TLS and access rules (docs/howto/security.md)
   gripmon router configs/zenoh/local.json5             without security, on this machine only
 
 exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""

@@ -8,15 +8,13 @@ import urllib.parse
 from collections import Counter
 from typing import Annotated, Literal
 
-import cv2
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from gripmon import __version__
 from gripmon.client import Ambiguous, Condition, Fleet, MonitorName, MonitorStatus, NotCarriedOut, trouble
 from gripmon.daemon.mount import MountView, view_of
-from gripmon.daemon.overlay import overlay
+from gripmon.daemon.overlay import picture_of
 from gripmon.model.records import CommandName, CommandReply, StandingAlert
 from gripmon.teach.messages import BadRequest, Request
 from gripmon.teach.page_server import Action, Served, web_files
@@ -187,12 +185,11 @@ class FleetSite:
         snapshot = reply.snapshot
         if not reply.done or snapshot is None:
             raise BadRequest(_short(reply.text))
-        image = None if not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise BadRequest("its newest frame has no image")
-        record, wanted = snapshot.record, snapshot.reference_px if mount else None
-        jpeg = overlay(np.asarray(image), record, snapshot.outlines_px, PICTURE_PX, wanted)
-        view = view_of(reply, *name) if mount else None
+        try:
+            jpeg = picture_of(snapshot, data, PICTURE_PX, snapshot.reference_px if mount else None)
+        except ValueError as error:
+            raise BadRequest(_short(str(error))) from None
+        record, view = snapshot.record, view_of(reply, *name) if mount else None
         return Picture(jpeg, record.stamp_ns, record.verdict.value, view)
 
     def _known(self, name: MonitorName, monitor_id: str) -> MonitorStatus:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gripmon.io.sources.payload import PayloadError, snapshot_image
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, FrameRecord, Image, Outlines
+from gripmon.model.records import Array, FrameRecord, Image, Outlines, Snapshot
 from gripmon.teach.drawing import Canvas, Colour
 from gripmon.teach.snapping import outlines_px
 
@@ -26,6 +27,21 @@ def outlines_of(camera: Camera, gripper: Gripper, cam_T_grip: Array | None, jaw_
     opening_m = jaw_opening_m if gripper.has_jaw else None
     lines = outlines_px(camera, gripper, cam_T_grip, opening_m, _POINTS).values()
     return tuple(tuple((round(float(u), 2), round(float(v), 2)) for u, v in line) for line in lines)
+
+
+def picture_of(
+    snapshot: Snapshot, data: bytes | None, width_px: int, reference_px: Outlines | None = None
+) -> bytes:
+    """:func:`overlay` of a monitor's snapshot, whose image is ``data``.  Raises ValueError, which says why there is no
+    picture.
+    """
+    if not data or snapshot.image is None:
+        raise ValueError("its newest frame has no image")
+    try:
+        image = snapshot_image(data, snapshot.image)
+    except PayloadError as error:
+        raise ValueError(f"its image: {error}") from None
+    return overlay(image, snapshot.record, snapshot.outlines_px, width_px, reference_px)
 
 
 def overlay(

@@ -295,7 +295,11 @@ def _open_input(
         source = start(settings)
     except SourceError as error:
         raise InputError(f"{path}: {error}") from None
-    lens = getattr(source, "camera", None)
+    try:
+        lens = None if config is None else getattr(source, "camera", None)
+    except SourceError as error:  # fatal to nobody who brings his own
+        warn(f"the frames' own camera calibration can't be used ({error}); the configuration's is used")
+        return source
     if config is not None and lens is not None and (off := lens_fault(lens, config)) is not None:
         warn(off)
     return source

@@ -43,7 +43,9 @@ def _header(stamp_ns: int):
     return STORE.types["std_msgs/msg/Header"](stamp=time, frame_id="wrist")
 
 
-def ros_messages(shots: Shots, *, raw: bool = False, topic: str = "/wrist/image", calibrated: bool = True):
+def ros_messages(
+    shots: Shots, *, raw: bool = False, topic: str = "/wrist/image", calibrated: bool = True, encode: str = ".png"
+):
     """(topic, type, log time, message): each image after the joint state of its time, which is logged 3 ms later."""
     types = STORE.types
     if shots.lens is not None:
@@ -65,17 +67,18 @@ def ros_messages(shots: Shots, *, raw: bool = False, topic: str = "/wrist/image"
             height, width = image.shape[:2]
             kind, of = "sensor_msgs/msg/Image", (height, width, "mono8", 0, width, image.ravel())
         else:
-            kind, of = "sensor_msgs/msg/CompressedImage", ("png", cv2.imencode(".png", image)[1].ravel())
+            kind, of = "sensor_msgs/msg/CompressedImage", (encode[1:], cv2.imencode(encode, image)[1].ravel())
         yield topic, kind, stamp_ns + 3_000_000, types[kind](_header(stamp_ns), *of)
 
 
-def write_mcap(path: Path, shots: Shots, **how) -> None:
-    """As ``ros2 bag record -s mcap`` does, in chunks of some frames."""
+def write_mcap(path: Path, shots: Shots, change=lambda message: message, **how) -> None:
+    """As ``ros2 bag record -s mcap`` does, in chunks of some frames; each message as ``change`` makes it."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=20_000)
         writer.start("ros2")
         channels: dict[str, int] = {}
-        for topic, kind, log_ns, message in ros_messages(shots, **how):
+        for topic, kind, log_ns, sent in ros_messages(shots, **how):
+            message = change(sent)
             if topic not in channels:
                 definition = STORE.generate_msgdef(kind)[0].encode()
                 schema = writer.register_schema(kind, "ros2msg", definition)

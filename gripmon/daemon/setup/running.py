@@ -11,14 +11,12 @@ import threading
 from collections import deque
 from pathlib import Path
 
-import cv2
 import msgspec
-import numpy as np
 
 from gripmon.client import Ambiguous, NotCarriedOut, TransformClient
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.mount import MountView, view_of
-from gripmon.daemon.overlay import outlines_of, overlay
+from gripmon.daemon.overlay import outlines_of, overlay, picture_of
 from gripmon.io.sources import FolderSettings
 from gripmon.io.wire import PublishError
 from gripmon.model.geometry import from_record
@@ -147,10 +145,8 @@ class MonitorProcess:
                     self._record = seen.record
                     self._mount = view_of(reply, settings.robot, settings.camera_name)
                     moved = reply.mount is not None and not reply.mount.within
-                    wanted = seen.reference_px if moved else None
-                    image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-                    if image is not None:
-                        self._picture = overlay(np.asarray(image), seen.record, seen.outlines_px, _PICTURE_PX, wanted)
+                    with contextlib.suppress(ValueError):
+                        self._picture = picture_of(seen, data, _PICTURE_PX, seen.reference_px if moved else None)
                         self._shown += 1
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_ASK_EVERY_S)

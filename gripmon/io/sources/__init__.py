@@ -117,9 +117,9 @@ def open_source(
 
 def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings | EpisodeSettings:
     """Settings for a recorded input given as text: a folder of images, a LeRobot dataset, a rosbag2 folder, an MCAP
-    file, otherwise a video file; ``fps`` (1/s) is used if the input has no time stamps.
+    or .db3 file, otherwise a video file; ``fps`` (1/s) is used if the input has no time stamps.
     """
-    if path.suffix.lower() == ".mcap" or (path.is_dir() and is_rosbag2(str(path))):
+    if path.suffix.lower() in (".mcap", ".db3") or (path.is_dir() and is_rosbag2(str(path))):
         return BagSettings(path=str(path))
     if path.is_dir() and is_lerobot(str(path)):
         return LeRobotSettings(path=str(path))

@@ -1,4 +1,4 @@
-"""Recorded messages: an MCAP file, or a folder of rosbag2, with images, joint states and camera calibrations.
+"""Recorded messages: an MCAP file, a .db3, or a folder of rosbag2, with images, joint states and camera calibrations.
 
 CDR is decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema in the file; JSON as Foxglove
 writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
@@ -10,15 +10,17 @@ import base64
 import functools
 import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from gripmon.calibrate.formats import InterchangeError, read_ros
 from gripmon.io.sources.base import SourceError, Stored
+from gripmon.io.sources.camera_info import lens_of
 from gripmon.io.sources.payload import PayloadError, message_image
+from gripmon.io.sources.stamps import Stamped, rising
 from gripmon.io.sources.stored import (
     VideoDecoder,
     decoded_file,
@@ -40,9 +42,11 @@ _JOINTS = ("JointState",)
 
 
 class BagSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="bag"):
-    """An MCAP file or a rosbag2 folder: frames with their stamps, and openings from joint states."""
+    """An MCAP file or a rosbag2: frames with their stamps, and openings from joint states."""
 
-    path: Annotated[str, msgspec.Meta(min_length=1, description="the .mcap file or the folder with metadata.yaml")]
+    path: Annotated[
+        str, msgspec.Meta(min_length=1, description="the .mcap or .db3 file, or the folder with metadata.yaml")
+    ]
     camera: (
         Annotated[str, msgspec.Meta(min_length=1, description="topic of the images; absent: the only one")] | None
     ) = None
@@ -87,11 +91,24 @@ class _Mcap:
     def messages(self, topics: list[str]) -> Iterator[_Message]:
         """Messages in order of their log times; of a truncated file in the file's order."""
         for schema, channel, message in self._records(topics):
-            data, encoding = message.data, channel.message_encoding
-            kind = _kind(schema.name)
-            yield _Message(channel.topic, kind, message.log_time, functools.partial(_decode, data, encoding, schema))
+            decode = functools.partial(self._decode, message.data, channel.message_encoding, schema)
+            yield _Message(channel.topic, _kind(schema.name), message.log_time, decode)
         if not self.whole:
             raise _CutShort("it has no summary")
+
+    def _decode(self, data: bytes, encoding: str, schema: Any) -> Any:
+        """A decoded message, its fields as attributes.  ValueError for an unsupported encoding."""
+        if encoding == "cdr":
+            return _from_cdr(data, schema.name, schema.data.decode(errors="replace"))
+        if encoding == "protobuf":
+            return self._protobuf.decoder_for(encoding, schema)(data)
+        if encoding == "json":
+            return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+        raise ValueError(f"a message in {encoding}; cdr, protobuf or json")
+
+    @functools.cached_property
+    def _protobuf(self) -> Any:
+        return needed("mcap_protobuf.decoder").DecoderFactory()
 
     def _records(self, topics: list[str] | None) -> Iterator[Any]:
         with opened(self._path) as stream:
@@ -118,18 +135,6 @@ def _kind(type_name: str) -> str:
     return type_name.replace(".", "/").rpartition("/")[2]
 
 
-def _decode(data: bytes, encoding: str, schema: Any) -> Any:
-    """A decoded message, its fields as attributes.  ValueError for an unsupported encoding."""
-    if encoding == "cdr":
-        return _from_cdr(data, schema.name, schema.data.decode(errors="replace"))
-    if encoding == "protobuf":
-        decoder = needed("mcap_protobuf.decoder").DecoderFactory().decoder_for(encoding, schema)
-        return decoder(data)
-    if encoding == "json":
-        return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
-    raise ValueError(f"a message in {encoding}; cdr, protobuf or json")
-
-
 def _from_cdr(data: bytes, type_name: str, definition: str = "") -> Any:
     store = typestore()
     if type_name not in store.types:
@@ -140,13 +145,11 @@ def _from_cdr(data: bytes, type_name: str, definition: str = "") -> Any:
 
 
 class _Rosbag2:
-    """A folder of rosbag2 with SQLite or MCAP files, on this machine."""
+    """A folder of rosbag2 with SQLite or MCAP files, or a bare .db3, on this machine."""
 
     whole = True
 
     def __init__(self, path: str) -> None:
-        from pathlib import Path
-
         from rosbags.rosbag2 import Reader
 
         system, inside = file_system(path)
@@ -189,67 +192,29 @@ def image_topics(types: dict[str, str]) -> list[str]:
 
 class BagSource(Stored):
     """Every image of a topic, in order of log time, with the stamp of its own header (if that is empty, the log's),
-    and the opening at that time.  Of a truncated file the last frame has no image, but a fault.
+    and the opening at that time.  A frame with a wrong stamp has no image, but a fault (:func:`rising`); so has the
+    last one of a truncated file.
 
-    ``topic``: that of the images.  ``camera``: their calibration in the file, None if there is none.  Raises
-    :class:`SourceError` for unreadable files, and for a missing topic or joints, with the names of the existing ones.
+    ``topic``: that of the images.  Raises :class:`SourceError` for unreadable files, and for a missing topic or joints,
+    with the names of the existing ones.
     """
 
     def __init__(self, settings: BagSettings, relative_to: str = "") -> None:
         self._path = settings.path if "://" in settings.path else joined(relative_to, settings.path)
         self._bag = open_messages(self._path)
         self.topic = self._chosen(settings.camera)
-        self._opening = settings.opening
-        self._stamps_ns, self._openings_m = self._joints()
-        self.camera = self._camera()
+        self._stamps_ns, self._openings_m = self._joints(settings.opening)
         self._decoder: VideoDecoder | None = None
-        self._seq, self._last_stamp_ns, self._open = 0, -1, True
+        self._open = True
         self._frames = self._read()
 
-    def read(self) -> Frame | None:
-        return next(self._frames, None) if self._open else None
+    @functools.cached_property
+    def camera(self) -> LensSettings | None:
+        """The images' calibration in the file: of the topic nearest by name; None if there is none, or several.
 
-    def close(self) -> None:
-        self._open = False
-
-    def _chosen(self, wanted: str | None) -> str:
-        topics = image_topics(self._bag.types)
-        if wanted in topics:
-            return str(wanted)
-        there = ", ".join(topics) or "none"
-        if wanted is not None:
-            raise SourceError(f"camera: {self._path} has no images on {wanted}; one of its topics with images: {there}")
-        if len(topics) != 1:
-            raise SourceError(f"camera: {self._path} has several topics with images, or none; one of: {there}")
-        return topics[0]
-
-    def _joints(self) -> tuple[np.ndarray, Array]:
-        """Stamps (n,) and openings (n,) of all reports, in order of time."""
-        if self._opening is None:
-            return np.empty(0, np.int64), np.empty(0)
-        topics = [topic for topic, name in self._bag.types.items() if _kind(name) in _JOINTS]
-        reports: list[tuple[int, float]] = []
-        names: set[str] = set()
-        try:
-            for message in self._bag.messages(topics) if topics else ():
-                found = message.decode()
-                names.update(found.name)
-                opening_m = self._opening.opening_m(dict(zip(found.name, map(float, found.position), strict=False)))
-                if opening_m is not None:
-                    reports.append((_stamp_ns(found) or message.log_ns, opening_m))
-        except _CutShort:
-            pass  # the images end there, too, and report it
-        except ValueError as error:
-            raise SourceError(f"opening: {self._path}: {error}") from None
-        if not reports:
-            there = ", ".join(sorted(names)) or "none"
-            wanted = ", ".join(self._opening.joints)
-            raise SourceError(f"opening.joints: {self._path} has no joint state of {wanted}; of its joints: {there}")
-        reports.sort()
-        return np.array([stamp for stamp, _ in reports], np.int64), np.array([opening for _, opening in reports])
-
-    def _camera(self) -> LensSettings | None:
-        topics = [topic for topic, name in self._bag.types.items() if _kind(name) in _CAMERAS]
+        Raises :class:`SourceError` for one that can't be used: only when it is asked for.
+        """
+        topics = self._topics(_CAMERAS)
         parent = self.topic
         near: list[str] = []
         while parent and not near:
@@ -263,41 +228,93 @@ class BagSource(Stored):
         except (_CutShort, ValueError) as error:
             raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {error}") from None
 
+    def read(self) -> Frame | None:
+        return next(self._frames, None) if self._open else None
+
+    def close(self) -> None:
+        self._open = False
+
+    def _topics(self, kinds: tuple[str, ...]) -> list[str]:
+        return sorted(topic for topic, name in self._bag.types.items() if _kind(name) in kinds)
+
+    def _chosen(self, wanted: str | None) -> str:
+        topics = self._topics(_IMAGES)
+        if wanted in topics:
+            return str(wanted)
+        there = ", ".join(topics) or "none"
+        if wanted is not None:
+            raise SourceError(f"camera: {self._path} has no images on {wanted}; one of its topics with images: {there}")
+        if len(topics) != 1:
+            raise SourceError(f"camera: {self._path} has several topics with images, or none; one of: {there}")
+        return topics[0]
+
+    def _joints(self, opening: JointOpening | None) -> tuple[np.ndarray, Array]:
+        """Stamps (n,) and openings (n,) of all reports, in order of time."""
+        if opening is None:
+            return np.empty(0, np.int64), np.empty(0)
+        reports: list[tuple[float, Stamped]] = []
+        names: set[str] = set()
+        topics = self._topics(_JOINTS)
+        try:
+            for message in self._bag.messages(topics) if topics else ():
+                found = message.decode()
+                names.update(found.name)
+                opening_m = opening.opening_m(dict(zip(found.name, map(float, found.position), strict=False)))
+                if opening_m is not None:
+                    reports.append((opening_m, Stamped(_stamp_ns(found) or message.log_ns, message.log_ns)))
+        except _CutShort:
+            pass  # the images end there, too, and report it
+        except ValueError as error:
+            raise SourceError(f"opening: {self._path}: {error}") from None
+        if not reports:
+            there = ", ".join(sorted(names)) or "none"
+            wanted = ", ".join(opening.joints)
+            raise SourceError(f"opening.joints: {self._path} has no joint state of {wanted}; of its joints: {there}")
+        sound = [(stamp_ns, opening_m) for opening_m, stamp_ns, fault in rising(reports) if fault is None]
+        return np.array([stamp for stamp, _ in sound], np.int64), np.array([opening for _, opening in sound])
+
     def _read(self) -> Iterator[Frame]:
+        seq, stamp_ns = 0, 0
+        cut: list[str] = []
+        for (found, kind, fault), stamp_ns, wrong in rising(self._stamped(cut)):
+            image = None
+            if fault is None:  # of a video the next ones need it, too
+                image, fault = self._image(found, kind)
+            image, fault = (image, fault) if wrong is None else (None, wrong)
+            opening_m = openings_at(self._stamps_ns, self._openings_m, stamp_ns) if len(self._stamps_ns) else None
+            yield Frame(seq, stamp_ns, image, opening_m, self.topic, fault)
+            seq += 1
+        for why in cut:
+            fault = f"{self._path} is cut short or damaged after {seq} frames ({why})"
+            yield Frame(seq, stamp_ns, None, None, self.topic, fault)
+
+    def _stamped(self, cut: list[str]) -> Iterator[tuple[tuple[Any, str, str | None], Stamped]]:
+        """Each message, its kind, why it can't be decoded; ``cut`` gets the reason if the file isn't whole."""
         try:
             for message in self._bag.messages([self.topic]):
-                yield self._frame(message)
+                found, fault, stamp_ns = None, None, message.log_ns
+                try:
+                    found = message.decode()
+                    stamp_ns = _stamp_ns(found) or stamp_ns
+                except Exception as error:  # noqa: BLE001  whatever a damaged message does, the others are sound
+                    fault = f"the message can't be decoded ({one_line(error):.200})"
+                yield (found, message.kind, fault), Stamped(stamp_ns, message.log_ns)
         except _CutShort as error:
-            fault = f"{self._path} is cut short or damaged after {self._seq} frames ({error})"
-            yield Frame(self._seq, max(self._last_stamp_ns, 0), None, None, self.topic, fault)
-
-    def _frame(self, message: _Message) -> Frame:
-        stamp_ns, opening_m = message.log_ns, None
-        try:
-            found = message.decode()
-            stamp_ns = _stamp_ns(found) or stamp_ns
-            image, fault = self._image(found, message.kind)
-        except Exception as error:  # noqa: BLE001  whatever a damaged message does, the others are sound
-            image, fault = None, f"the message can't be decoded ({one_line(error):.200})"
-        if stamp_ns <= self._last_stamp_ns:
-            image, fault = None, "its time stamp does not rise"
-        if len(self._stamps_ns):
-            opening_m = openings_at(self._stamps_ns, self._openings_m, stamp_ns)
-        self._last_stamp_ns = max(stamp_ns, self._last_stamp_ns)
-        self._seq += 1
-        return Frame(self._seq - 1, self._last_stamp_ns, image, opening_m, self.topic, fault)
+            cut.append(str(error))
 
     def _image(self, message: Any, kind: str) -> tuple[Image | None, str | None]:
-        data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
-        if kind == "CompressedImage":
-            return decoded_file(data)
-        if kind == "CompressedVideo":
-            self._decoder = self._decoder or VideoDecoder(message.format)
-            return self._decoder.decode(data)
         try:
+            data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+            if kind == "CompressedImage":
+                return decoded_file(data)
+            if kind == "CompressedVideo":
+                self._decoder = self._decoder or VideoDecoder(message.format)
+                return self._decoder.decode(data)
             return message_image(message, data, (int(message.width), int(message.height))), None
         except PayloadError as error:
             return None, str(error)
+        except Exception as error:  # noqa: BLE001  as above
+            return None, f"the message can't be decoded ({one_line(error):.200})"
 
 
 def _stamp_ns(message: Any) -> int:
@@ -308,29 +325,3 @@ def _stamp_ns(message: Any) -> int:
     # As ROS names them, Foxglove's JSON, and Protobuf.
     seconds = max(getattr(stamp, name, 0) for name in ("sec", "seconds"))
     return int(seconds) * 1_000_000_000 + int(max(getattr(stamp, name, 0) for name in ("nanosec", "nsec", "nanos")))
-
-
-def lens_of(message: Any, *, rectified: bool = False) -> LensSettings | None:
-    """The camera of a CameraInfo or CameraCalibration; None for one that was never calibrated (its K is 0).
-
-    ``rectified``: for images that ROS has rectified, P's pinhole without distortion.  ValueError for an unsupported
-    lens.
-    """
-    k, d, p = (np.array(getattr(message, a, getattr(message, a.upper(), ()))).astype(float) for a in "kdp")
-    if k.size != 9 or not k.any():
-        return None
-    if rectified and p.size == 12 and p.any():
-        k, d = p.reshape(3, 4)[:, :3].ravel(), np.empty(0)
-    content = {
-        "image_width": int(message.width),
-        "image_height": int(message.height),
-        "distortion_model": message.distortion_model or "plumb_bob",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": k.tolist()},
-        "distortion_coefficients": {"rows": 1, "cols": d.size, "data": d.tolist()},
-    }
-    if rectified or not d.size:
-        content["distortion_model"] = "plumb_bob"
-    try:
-        return read_ros(json.dumps(content).encode(), "camera_info")
-    except InterchangeError as error:
-        raise ValueError(str(error)) from None

@@ -202,6 +202,8 @@ class VideoSource(Stored):
         self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise SourceError(f"path: {self._path} can't be opened as a video; a complete file in a format of FFmpeg's")
+        # Pixels are as the sensor has them, as in every other container: the lens is of the sensor.
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         self._stamp_property = cv2.CAP_PROP_POS_MSEC
         self._announced = round(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # an estimate in some containers
         self._fps = settings.fps

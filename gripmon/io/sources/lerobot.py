@@ -1,13 +1,15 @@
-"""Episodes of LeRobot datasets, of formats 2.0, 2.1 and 3.0: Parquet tables with MP4 videos, or with images inside.
+"""Episodes of LeRobot datasets, of formats 2.1 and 3.0: Parquet tables with MP4 videos, or with images inside.
 
 The formats are those of ``lerobot.datasets`` (its ``utils.py`` and ``v30``): format 2 has one video and one table per
-episode, format 3 several episodes in each, and a table of episodes with their places.
+episode, format 3 several episodes in each, and a table of episodes with their places.  A dataset may be a stranger's:
+its description is checked, and its paths lead to files inside it.
 """
 
 from __future__ import annotations
 
 import functools
-import json
+import re
+import string
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -38,45 +40,96 @@ class LeRobotSettings(
     opening: JointOpening | None = None
 
 
+class _Feature(msgspec.Struct, frozen=True):
+    dtype: str
+    shape: tuple[int, ...] = ()
+    names: Any = None
+
+
+class _Info(msgspec.Struct, frozen=True):
+    """What is used of ``meta/info.json``."""
+
+    codebase_version: str
+    fps: Annotated[float, msgspec.Meta(gt=0, le=10_000)]
+    features: dict[str, _Feature]
+    data_path: str
+    video_path: str | None = None
+    chunks_size: Annotated[int, msgspec.Meta(ge=1)] = 1000
+
+
+_Number = Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
+_Value = Annotated[float, msgspec.Meta(ge=0, lt=1e9)] | None
+_MOST_JOINTS = 1000
+
+
+class _Episode(msgspec.Struct, frozen=True):
+    episode_index: _Number
+
+
 @dataclass(frozen=True)
 class LeRobotDataset:
-    """A dataset's description; ``episodes`` by number."""
+    """A dataset's description; ``info`` as it is in the file, ``episodes`` by number with their places."""
 
     path: str
     info: dict[str, Any]
+    description: _Info
     episodes: dict[int, dict[str, Any]] = field(repr=False)
 
     @property
     def cameras(self) -> list[str]:
         """Names of the image features."""
-        return sorted(name for name, one in self.info["features"].items() if one["dtype"] in ("video", "image"))
+        return sorted(name for name, one in self.description.features.items() if one.dtype in ("video", "image"))
 
     @property
     def joints(self) -> list[str]:
         """Names of the numbers in the robot's state, in order; if it names none, their indices."""
-        state = self.info["features"].get(_STATE)
+        state = self.description.features.get(_STATE)
         if state is None:
             return []
-        names = state.get("names")
-        if isinstance(names, dict):
-            names = [name for group in names.values() for name in group]
-        return [str(name) for name in names] if names else [str(i) for i in range(state["shape"][0])]
+        groups = state.names.values() if isinstance(state.names, dict) else [state.names]
+        names = [str(name) for group in groups if isinstance(group, list) for name in group]
+        return names or [str(i) for i in range(min(sum(state.shape[:1]), _MOST_JOINTS))]
 
     def table(self, episode: int) -> str:
-        """Path of the table that has the episode's rows."""
-        row = self.episodes[episode]
-        places = {"chunk_index": row.get("data/chunk_index"), "file_index": row.get("data/file_index")}
-        return joined(self.path, self.info["data_path"].format(**places, **self._old(episode)))
+        """Path of the table that has the episode's rows.  Raises :class:`SourceError`."""
+        return self._file("data_path", self._places(episode, "data"))
 
     def video(self, episode: int, camera: str) -> tuple[str, float]:
-        """Path of the video with the episode, and when that begins in it (s)."""
-        row, old = self.episodes[episode], self._old(episode)
-        at = {name: row.get(f"videos/{camera}/{name}") for name in ("chunk_index", "file_index")}
-        path = joined(self.path, self.info["video_path"].format(**at, **old, video_key=camera))
-        return path, float(row.get(f"videos/{camera}/from_timestamp") or 0.0)
+        """Path of the video with the episode, and when that begins in it (s).  Raises :class:`SourceError`."""
+        places = self._places(episode, f"videos/{camera}")
+        begin_s = self._number(episode, f"videos/{camera}/from_timestamp") or 0.0
+        return self._file("video_path", places | {"video_key": camera}), begin_s
 
-    def _old(self, episode: int) -> dict[str, int]:
-        return {"episode_index": episode, "episode_chunk": episode // int(self.info.get("chunks_size", 1000))}
+    def _places(self, episode: int, of: str) -> dict[str, int | str]:
+        found = {name: self._number(episode, f"{of}/{name}") for name in ("chunk_index", "file_index")}
+        places: dict[str, int | str] = {name: int(at) for name, at in found.items() if at is not None}
+        return places | {"episode_index": episode, "episode_chunk": episode // self.description.chunks_size}
+
+    def _number(self, episode: int, key: str) -> float | None:
+        """A value of the episode's row.  Raises :class:`SourceError`."""
+        try:
+            return msgspec.convert(self.episodes[episode].get(key), _Value)
+        except msgspec.ValidationError as error:
+            wrong = f"path: {self.path}: episode {episode}: {key}: {one_line(error):.100}"
+            raise SourceError(f"{wrong}; a number") from None
+
+    def _file(self, key: str, fields: dict[str, int | str]) -> str:
+        """A path by its template: fields and widths as the formats have them, below the dataset."""
+        template = getattr(self.description, key)
+        try:
+            for _, name, width, conversion in string.Formatter().parse(template or "{}"):
+                if name is not None and (name not in fields or conversion or not _WIDTH.fullmatch(width or "")):
+                    raise ValueError(f"{{{name}}} of width {width or 'any'}")
+            path = template.format(**fields)
+        except (ValueError, KeyError, IndexError) as error:
+            right = f"a path of {', '.join(fields)}, such as {{episode_index:06d}}"
+            raise SourceError(f"path: {self.path}: {INFO}: {key}: {one_line(error):.100}; {right}") from None
+        if "\0" in path or "\\" in path or not {"", ".", ".."}.isdisjoint(path.split("/")):
+            raise SourceError(f"path: {self.path}: {INFO}: {key}: {path[:100]!r} leads out of it; a path below it")
+        return joined(self.path, path)
+
+
+_WIDTH = re.compile(r"(0?\d\d?d)?")
 
 
 @functools.lru_cache(maxsize=4)
@@ -84,21 +137,23 @@ def open_dataset(path: str) -> LeRobotDataset:
     """Read a dataset's description.  Raises :class:`SourceError` if it isn't a dataset, or of another format."""
     try:
         with opened(joined(path, INFO)) as file:
-            info = json.load(file)
-        version = str(info["codebase_version"])
+            content = file.read()
+        info = msgspec.json.decode(content, type=dict[str, Any])
+        version = str(info.get("codebase_version"))
+        if not version.startswith(("v2.1", "v3.")):
+            raise SourceError(f"path: {path} is a LeRobot dataset of format {version:.20}; v2.1 or v3.0")
+        description = msgspec.json.decode(content, type=_Info)
         if version.startswith("v3."):
-            episodes = _episodes_of_3(path)
-        elif version.startswith("v2."):
-            with opened(joined(path, "meta/episodes.jsonl")) as file:
-                episodes = [json.loads(line) for line in file if line.strip()]
+            rows = _episodes_of_3(path)
         else:
-            raise SourceError(f"path: {path} is a LeRobot dataset of format {version}; v2.0, v2.1 or v3.0")
-        info["features"], info["data_path"]
-    except (KeyError, ValueError, TypeError) as error:
+            with opened(joined(path, "meta/episodes.jsonl")) as file:
+                rows = [msgspec.json.decode(line, type=dict[str, Any]) for line in file if line.strip()]
+        episodes = {msgspec.convert(row, _Episode).episode_index: row for row in rows}
+    except (ValueError, TypeError, RecursionError) as error:
         if isinstance(error, SourceError):
             raise
         raise SourceError(f"path: {path} isn't a LeRobot dataset ({one_line(error):.200}); a complete one") from None
-    return LeRobotDataset(path, info, {int(row["episode_index"]): row for row in episodes})
+    return LeRobotDataset(path, info, description, episodes)
 
 
 def _episodes_of_3(path: str) -> list[dict[str, Any]]:
@@ -106,16 +161,14 @@ def _episodes_of_3(path: str) -> list[dict[str, Any]]:
 
     system, inside = file_system(path)
     rows: list[dict[str, Any]] = []
-    for name in sorted(system.glob(joined(inside, "meta/episodes/*/*.parquet"))):
+    for name in filter(system.isfile, sorted(system.glob(joined(inside, "meta/episodes/*/*.parquet")))):
         with system.open(name, "rb") as file:
             table = parquet.ParquetFile(file)
             # The table has hundreds of further columns of statistics.
-            wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c[:5] in _PLACES]
+            places = ("data/", "video")
+            wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c.startswith(places)]
             rows += table.read(columns=wanted).to_pylist()
     return rows
-
-
-_PLACES = ("data/", "video")
 
 
 class LeRobotSource(Stored):
@@ -135,7 +188,8 @@ class LeRobotSource(Stored):
         self._camera = _chosen("camera", settings.camera, dataset.cameras, path)
         self._episode = int(_chosen("episode", settings.episode, sorted(dataset.episodes), path))
         self._time_s, self._openings_m, self._files = self._rows(settings.opening)
-        self._images = self._decoded()
+        video = None if self._files is not None else dataset.video(self._episode, self._camera)
+        self._images = self._decoded(video)
         self._seq, self._open = 0, True
 
     def __len__(self) -> int:
@@ -157,7 +211,7 @@ class LeRobotSource(Stored):
         from pyarrow import parquet
 
         dataset = self._dataset
-        is_video = dataset.info["features"][self._camera]["dtype"] == "video"
+        is_video = dataset.description.features[self._camera].dtype == "video"
         columns = ["timestamp", *([] if is_video else [self._camera]), *([] if opening is None else [_STATE])]
         if opening is not None and (missing := [name for name in opening.joints if name not in dataset.joints]):
             named = ", ".join(dataset.joints) or "none"
@@ -172,20 +226,21 @@ class LeRobotSource(Stored):
                     state = np.array(table[_STATE].to_pylist(), float).reshape(len(time_s), -1)
                     at = [dataset.joints.index(name) for name in opening.joints]
                     openings_m = opening.offset_m + opening.scale * state[:, at].sum(axis=1)
-            except (OSError, ValueError, KeyError, IndexError) as error:
+            except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
                 raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole table") from None
         if not len(time_s) or (np.diff(time_s) <= 0.0).any():
             raise SourceError(f"path: {path}: episode {self._episode} has no rows, or time stamps that don't rise")
         return time_s, openings_m, None if is_video else table[self._camera].to_pylist()
 
-    def _decoded(self) -> Iterator[tuple[Image | None, str | None]]:
+    def _decoded(self, video: tuple[str, float] | None) -> Iterator[tuple[Image | None, str | None]]:
         """A value for each row."""
-        if self._files is not None:
-            for row in self._files:
-                yield decoded_file(row["bytes"] or b"")
+        if video is None:
+            for row in self._files or ():
+                found = row.get("bytes") if isinstance(row, dict) else None
+                yield decoded_file(found) if isinstance(found, bytes) and found else (None, "the table has none here")
             return
-        path, begin_s = self._dataset.video(self._episode, self._camera)
-        half_s = 0.5 * float(np.median(np.diff(self._time_s))) if len(self) > 1 else 0.5 / self._dataset.info["fps"]
+        path, begin_s = video
+        half_s = 0.5 * float(np.median(np.diff(self._time_s))) if len(self) > 1 else 0.5 / self._dataset.description.fps
         row, fault = 0, None
         frames = _video_frames(path, begin_s - half_s)
         grey = needed("av.video.reformatter").VideoReformatter()

@@ -15,13 +15,16 @@ from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG, PNG
 from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.pixels import ENCODINGS, unpacked
-from gripmon.model.records import FrameNote, Image, MessageRefused, from_json
+from gripmon.model.records import FrameNote, Image, MessageRefused, SnapshotImage, from_json
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
 LARGEST_PX = 20_000
 """Largest width and height of a camera's image whose size isn't known beforehand, px."""
+
+SMALLEST_PX, MOST_PIXELS = 16, (64 << 20) // 3
+"""Least width and height of a camera's image, px, and most pixels: as many as a message of 64 MiB holds in colour."""
 
 MOST_SCANS = 100
 """A progressive JPEG has some ten; each one costs as much as the whole image, however few bytes it has."""
@@ -102,6 +105,31 @@ def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
         with _open_file(payload) as file:
             check_size(file.size, expected_px)
             return _array_of(file)
+
+
+def snapshot_image(payload: bytes, stated: SnapshotImage) -> Image:
+    """The PNG or JPEG attached to a snapshot -> H x W, or H x W x 3 (BGR), uint8 or uint16.
+
+    Anyone may be the sender, and a few kB may be gigabytes of pixels: its header is compared with the size ``stated``,
+    and that with a camera's, before a pixel is decoded.  Raises :class:`PayloadError`.
+    """
+    import cv2
+
+    size_px = stated.width_px, stated.height_px
+    if min(size_px) < SMALLEST_PX or size_px[0] * size_px[1] > MOST_PIXELS:
+        right = f"at least {SMALLEST_PX} each way, at most {MOST_PIXELS} in all"
+        raise PayloadError(f"{size_px[0]}x{size_px[1]} pixels; {right}")
+    if not payload.startswith((JPEG, PNG)):
+        raise PayloadError(f"no PNG or JPEG file: it begins with {payload[:8].hex() or 'nothing'}")
+    with _damaged("PNG" if payload.startswith(PNG) else "JPEG"):
+        if payload.startswith(JPEG):
+            _check_jpeg(payload)
+        with _open_file(payload) as file:
+            check_size(file.size, size_px)
+        image = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise PayloadError("a damaged file; a whole one")
+    return np.asarray(image[:, :, :3] if image.ndim == 3 else image)
 
 
 def jpeg_in_colour(payload: bytes) -> Image:

@@ -12,8 +12,8 @@ import numpy as np
 from gripmon.io.jaw import LARGEST_OPENING_M, Openings, ReportedOpening
 from gripmon.io.ros2.node import Ros2Missing, RosNode, check_rclpy
 from gripmon.io.ros2.settings import Domain, Topic
-from gripmon.io.sources.bags import lens_of
 from gripmon.io.sources.base import SourceError
+from gripmon.io.sources.camera_info import lens_of
 from gripmon.io.sources.network import Arrival, ArrivingCamera, Content, SilentAfter, largest_bytes_of
 from gripmon.io.sources.payload import PayloadError, file_image, message_image
 from gripmon.io.wire.link import Malformed

@@ -42,7 +42,9 @@ def opened(path: str) -> IO[bytes]:
     """A file to read and to seek in.  Raises :class:`SourceError`."""
     try:
         if "://" not in path:
-            return Path(path).open("rb")
+            if (local := Path(path)).exists() and not local.is_file():  # a pipe or a device might never end
+                raise SourceError(f"path: {path} is not a regular file; one")
+            return local.open("rb")
         system, inside = file_system(path)
         found: IO[bytes] = system.open(inside, "rb")
         return found
@@ -91,14 +93,16 @@ def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int)
 
 def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
     """The image in a JPEG's or PNG's bytes, only its brightness (nothing else is measured); or why there is
-    none.
+    none.  Pixels are as the sensor has them, whatever EXIF says of the way up: the lens is of the sensor.
     """
     import cv2
+
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
     if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
         return None, fault
     try:
-        image: Image | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+        image: Image | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     return image, None if image is not None else "truncated, damaged or not an image"

@@ -15,12 +15,11 @@ from gripmon.io.wire.session import (
     PublishSettings,
     ZenohFileError,
     endpoints,
-    endpoints_fault,
-    in_short,
     load_file,
     open_session,
     value_of,
     zenoh_config,
+    zenohs_words,
 )
 
 if TYPE_CHECKING:
@@ -118,7 +117,7 @@ class Link:
             try:
                 session.close()
             except zenoh.ZError as error:  # a stopped process blocks what is being sent
-                _log.warning("the Zenoh session could not be closed in order: %s", in_short(error))
+                _log.warning("the Zenoh session could not be closed in order: %s", zenohs_words(error))
 
     def _look(self, session: zenoh.Session) -> None:
         places = missing(session, self._endpoints, one_is_enough=self._is_client)
@@ -150,7 +149,7 @@ class Link:
             try:
                 session = zenoh.open(config)
             except zenoh.ZError as error:
-                if (text := f"no Zenoh session yet, trying again: {in_short(error)}") != self._fault:
+                if (text := f"no Zenoh session yet, trying again: {zenohs_words(error)}") != self._fault:
                     _log.warning("%s", text)
                     self._fault = text
                 self._closing.wait(pause_s)
@@ -209,20 +208,15 @@ class Router:
         config = load_file(path, default_mode="router")
         if (mode := value_of(config, "mode")) != "router":
             raise ZenohFileError(f"{path}: mode: {mode} doesn't route; router")
-        self.listens_on = _endpoints(value_of(config, "listen/endpoints"))
+        self.listens_on = endpoints(config, "listen")
         if not self.listens_on:
             raise ZenohFileError(f'{path}: listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]')
-        if fault := endpoints_fault(config):
-            raise ZenohFileError(f"{path}: {fault[0]}.endpoints: {fault[1]}")
         self._connects_to = endpoints(config, "connect")
         config.insert_json5("listen/exit_on_failure", "true")
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
-                remedy = "stop the program that has it, or choose another port"
-                raise ZenohFileError(f"{path}: listen.endpoints: {taken[1]} is already in use; {remedy}") from error
-            raise ZenohFileError(f"{path}: can't route: {in_short(error)}") from error
+            raise ZenohFileError(f"{path}: can't route: {zenohs_words(error)}") from error
 
     def __enter__(self) -> Self:
         return self
@@ -238,12 +232,6 @@ class Router:
     def close(self) -> None:
         """Leave the network and free the port."""
         self._session.close()
-
-
-def _endpoints(listed: object) -> tuple[str, ...]:
-    if isinstance(listed, dict):
-        listed = listed.get("router")
-    return tuple(map(str, listed)) if isinstance(listed, list) else ()
 
 
 REMEMBERED_S = 60.0

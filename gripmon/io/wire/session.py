@@ -41,14 +41,12 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
             config = load_file(path)
         except ZenohFileError as error:
             raise PublishError("zenoh_config", str(error)) from error
-        if fault := endpoints_fault(config):
-            raise PublishError("zenoh_config", f"{path}: {fault[0]}/endpoints: {fault[1]}")
         return config
     if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
         raise PublishError("connect", "a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
     for key in ("listen", "connect"):
         for endpoint in getattr(settings, key):
-            if wrong := form_fault(endpoint):
+            if wrong := endpoint_fault(endpoint):
                 raise PublishError(key, wrong)
     config = zenoh.Config()
     listen = settings.listen if settings.mode == "peer" else ()
@@ -79,9 +77,7 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         try:
             config.insert_json5(key, msgspec.json.encode(value).decode())
         except zenoh.ZError as error:
-            raise PublishError(key.split("/")[0], in_short(error)) from error
-    if fault := endpoints_fault(config):
-        raise PublishError(*fault)
+            raise PublishError(key.split("/")[0], zenohs_words(error)) from error
     return config
 
 
@@ -111,15 +107,14 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
         keys = [key for key in ("listen", "connect") if getattr(settings, key)]
         if settings.zenoh_config is not None:
             keys = ["zenoh_config"]
-        if taken := re.search(r"bound to ([^\s#]+)\S*: .*Address already in use", str(error)):
-            remedy = "stop the program that has it, or choose another port"
-            raise PublishError(keys[0], f"{taken[1]} is already in use; {remedy}") from error
-        text = f"can't open a Zenoh session: {in_short(error)}"
-        raise PublishError(" or publish.".join(keys), text) from error
+        raise PublishError(" or publish.".join(keys), f"can't open a Zenoh session: {zenohs_words(error)}") from error
 
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
+_ENDPOINT_PATTERN = (
+    r"^((tcp|udp|tls|quic|ws)/(\[[^\]\s]+\]|[^:/\[\]\s]+):(?P<port>\d{1,5})([?#]\S*)?"
+    r"|(serial|unixsock-stream|unixpipe|vsock)/\S+)(?![\s\S])"
+)
 _NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
 KEY_PATTERN = r"^[^/*$#?\s]+(/[^/*$#?\s]+)*(?![\s\S])"
 """A key as one may put on it: no wildcards, no blanks."""
@@ -188,11 +183,15 @@ class Keys:
         return f"gripmon/{self.robot}/{self.camera}/{leaf}"
 
 
-def form_fault(endpoint: object) -> str:
-    """What is wrong with an endpoint's form, and what would be right; empty if it can be one."""
-    if not isinstance(endpoint, str) or not re.fullmatch(_ENDPOINT_PATTERN.rstrip("$"), endpoint):
-        return f"{endpoint!r} is not an endpoint; protocol/address, e.g. {DEFAULT_ENDPOINT}"
+def endpoint_fault(endpoint: object) -> str:
+    """What is wrong with an endpoint's form, and what would be right; empty if nothing is."""
+    form = re.match(_ENDPOINT_PATTERN, endpoint) if isinstance(endpoint, str) else None
+    if form is None or int(form["port"] or 0) > _LARGEST_PORT:
+        return f"{endpoint!r} is not an endpoint; protocol/host:port, e.g. {DEFAULT_ENDPOINT}"
     return ""
+
+
+_LARGEST_PORT = 65535
 
 
 def check_name(role: str, name: str) -> str:
@@ -261,10 +260,7 @@ def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(path)
     except zenoh.ZError as error:
-        if _is_gripmons(path):
-            right = "one of Zenoh's, as those in configs/zenoh are"
-            raise ZenohFileError(f"{path}: this is gripmon's configuration, not Zenoh's; {right}") from error
-        raise ZenohFileError(f"{path}: {in_short(error)}") from error
+        raise ZenohFileError(f"{path}: {zenohs_words(error)}; a file of Zenoh's, as in configs/zenoh") from error
     if value_of(config, "mode") is None:
         config.insert_json5("mode", _json(default_mode))
     if value_of(config, "listen/endpoints") == value_of(zenoh.Config(), "listen/endpoints"):
@@ -280,12 +276,6 @@ def value_of(config: zenoh.Config, key: str) -> object:
     return msgspec.json.decode(config.get_json(key))
 
 
-def _is_gripmons(path: Path) -> bool:
-    """Whether this is a gripmon configuration given in place of Zenoh's; called only if Zenoh can't read it."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return len(set(re.findall(r"^(robot|camera|gripper|reference|monitor)\s*:", text, re.MULTILINE))) > 1
-
-
 def _find_tls_files(config: zenoh.Config, path: Path) -> None:
     for name in _TLS_FILES:
         key = f"{_TLS}/{name}"
@@ -294,18 +284,10 @@ def _find_tls_files(config: zenoh.Config, path: Path) -> None:
             continue
         file = path.parent / value
         if not file.is_file():
-            raise ZenohFileError(f"{path}: {key}: no file {file}; {_remedy(name, file)}")
+            raise ZenohFileError(f"{path}: {key}: no file {file}; docs/howto/security.md shows how to make it")
         if name in _SECRETS and file.stat().st_mode & 0o077:
             raise ZenohFileError(f"{path}: {key}: others may read {file}; chmod 600 {file}")
         config.insert_json5(key, _json(str(file.resolve())))
-
-
-def _remedy(name: str, file: Path) -> str:
-    """How to get a missing certificate or key: a second authority would not help."""
-    if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
-        host = " --host ADDRESS" if name.startswith("listen") else ""
-        return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
-    return "copy it from where the certificates were made (by gripmon certificates, once for all machines)"
 
 
 def _json(value: str) -> str:
@@ -313,51 +295,11 @@ def _json(value: str) -> str:
 
 
 _SOURCE_PLACE = re.compile(r"\s+at \S+\.rs:\d+\.?")
-_PARSER = re.compile(r"\s*--> (?P<line>\d+):(?P<column>\d+)\n.*\n\s*= (?P<text>.*)", re.DOTALL)
-_MESSAGE = re.compile(
-    r'.*?(?:Message \{ msg: |Error\()"(?P<text>(?:[^"\\]|\\.)*)"'
-    r"(?:.*?line: (?P<line>\d+), column: (?P<column>\d+))?.*",
-    re.DOTALL,
-)
-_SCANNER = re.compile(
-    r'.*Error \{.* problem: "(?P<text>(?:[^"\\]|\\.)*)".*problem_mark: Mark \{ line: (?P<line>\d+), '
-    r"column: (?P<column>\d+) \}.*",
-    re.DOTALL,
-)
-_UNREACHED = re.compile(r"Unable to connect to any of \[(?P<ends>.*)\]")
-_ENCRYPTED = ("tls/", "quic/")
 
 
-def in_short(error: zenoh.ZError) -> str:
-    """Zenoh's message on one line: ``line 3, column 5: what is wrong`` for a file, without its own data structures and
-    the places in its source files.
-    """
-    text = _SOURCE_PLACE.sub("", str(error))
-    for form in (_PARSER, _SCANNER, _MESSAGE):
-        if found := form.fullmatch(text):
-            place = f"line {found['line']}, column {found['column']}: " if found["line"] else ""
-            message = re.sub(r"expected struct \w+", "a mapping was expected", found["text"].replace('\\"', '"'))
-            return place + " ".join(message.split())
-    if found := _UNREACHED.search(text):
-        return _unreached(found["ends"])
-    return " ".join(text.split())
-
-
-def _unreached(ends: str) -> str:
-    """Which connections are missing, and the possible reason: Zenoh reports the same for all of them."""
-    endpoints = re.findall(r"Single\((.*?)\)(?=, |$)", ends) or [ends]
-    reason = "no program listens there"
-    if any(endpoint.startswith(_ENCRYPTED) for endpoint in endpoints):
-        reason += (
-            ", or the certificates don't fit: of another authority, expired, or the router's is not for this address"
-        )
-    return f"no connection to {' or '.join(endpoints)} ({reason})"
-
-
-_ADDRESS = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
-_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
-_WITH_CERTIFICATE = ("tls", "quic")
-_LARGEST_PORT = 65535
+def zenohs_words(error: zenoh.ZError) -> str:
+    """Zenoh's message on one line, without the places in its source files."""
+    return " ".join(_SOURCE_PLACE.sub("", str(error)).split())
 
 
 def endpoints(config: zenoh.Config, which: str) -> tuple[str, ...]:
@@ -367,42 +309,3 @@ def endpoints(config: zenoh.Config, which: str) -> tuple[str, ...]:
         listed = listed.get(value_of(config, "mode") or "peer")
     # Zenoh also allows an object here: {"endpoints": [...], "policy": ...}; only Zenoh interprets it.
     return tuple(each for each in listed if isinstance(each, str)) if isinstance(listed, list) else ()
-
-
-def endpoint_fault(endpoint: str, *, listens: bool = False) -> str:
-    """What is wrong with an endpoint by itself, ``what is wrong; what would be right``; empty if nothing is.
-
-    A host's name isn't resolved, and only IP protocols are checked.
-    """
-    parts = _ADDRESS.match(endpoint)
-    if parts is None or parts["protocol"] not in _WITH_PORT:
-        return ""
-    host, colon, port = parts["address"].rpartition(":")
-    if not host or (host.startswith("[") and not host.endswith("]")):
-        missing = "host" if colon and not host else "port"
-        return f"{endpoint} has no {missing}; host and port, e.g. {parts['protocol']}/127.0.0.1:7447"
-    first = 0 if listens else 1  # 0: any that is free
-    if not re.fullmatch(r"[0-9]+", port) or not first <= int(port[:9]) <= _LARGEST_PORT:
-        return f"{endpoint}: {port or 'nothing'} can't be a port; a whole number, {first} to {_LARGEST_PORT}"
-    return ""
-
-
-def endpoints_fault(config: zenoh.Config) -> tuple[str, str] | None:
-    """``listen`` or ``connect``, and what is wrong with one of these endpoints; None if nothing is."""
-    for which in ("listen", "connect"):
-        for endpoint in endpoints(config, which):
-            if fault := endpoint_fault(endpoint, listens=which == "listen"):
-                return which, fault
-    for endpoint in endpoints(config, "listen"):
-        if endpoint.partition("/")[0] in _WITH_CERTIFICATE and not _has_certificate(config):
-            right = (
-                f"listen_certificate and listen_private_key of {_TLS} in a file of Zenoh's (see gripmon certificates)"
-            )
-            return "listen", f"{endpoint} needs a certificate; {right}"
-    return None
-
-
-def _has_certificate(config: zenoh.Config) -> bool:
-    names = ("listen_private_key", "listen_certificate")
-    # The last two forms hold the thing itself instead of a file's name.
-    return all(any(value_of(config, f"{_TLS}/{name}{form}") for form in ("", "_base64")) for name in names)
