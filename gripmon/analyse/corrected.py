@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
+from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR
 from gripmon.analyse.content import clock_time, count
-from gripmon.analyse.correction import BLOCK_S, SOURCES, Correction, correct, sample
-from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
-from gripmon.analyse.smoothing import MID_S, SLOW_S
+from gripmon.analyse.correction import SOURCES, Correction, correct, sample
+from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array, Origin, Transform
 from gripmon.record.recordings import Recording
@@ -128,20 +128,13 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
 
 def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
     """The provenance of a file."""
-    settings = {
-        "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
-        "block_s": BLOCK_S,
-        "slow_error_s": SLOW_S,
-        "mid_error_s": MID_S,
-    }
+    settings = {"false_alarms_per_hour": FALSE_ALARMS_PER_HOUR, "block_s": BLOCK_S, "slow_error_s": SLOW_S}
     return Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
 
 
 def _run(each: CorrectedRun) -> WrittenRun:
     recording, made = each.recording, each.correction
     seqs = recording.frames.seq
-    learnt = {name: getattr(made.learnt, name) for name in ("white", "mid", "slow", "frame", "unseen")}
-    learnt |= {"wander_per_s": made.dynamics.wander, "turn_per_s3": made.dynamics.turn}
     return WrittenRun(
         recording.recording_id,
         recording.robot,
@@ -159,7 +152,7 @@ def _run(each: CorrectedRun) -> WrittenRun:
             )
             for point in made.change_points
         ),
-        {name: tuple(values.tolist()) for name, values in learnt.items()},
+        {name: tuple(values.tolist()) for name, values in made.learnt.items()},
         (*recording.faults, *made.faults),
     )
 
