@@ -427,7 +427,7 @@ def test_a_drift_that_was_one_step_is_placed_at_its_change_point():
     assert abs(event.onset.stamp_ns - (START_NS + 200 * PERIOD_NS)) <= 0.4 * SECOND_NS, "frames are wild until 260"
     assert event.moved.size_m == pytest.approx(9e-4, rel=0.2)
     (old,) = [a for a in recording.affected if a.what == "old_calibration"]
-    assert old.start_ns == event.onset.stamp_ns and "it moved at once" in recording.summary
+    assert event.onset.earliest_ns <= old.start_ns <= event.onset.latest_ns and "it moved at once" in recording.summary
 
 
 def test_a_drift_that_takes_its_time_stays_one_and_its_times_off_do_not_overlap():

@@ -23,8 +23,8 @@ FALSE_ALARMS_PER_HOUR = 0.02
 MEAN_DOF = 24.0
 """Student's degrees of freedom of a mean of 8 frames: the drift test's 12 of a frame, times the cube root of 8."""
 CALM_FRACTION = 0.5
-"""Fraction of the squared differences, the smallest, that is taken as noise: a step shows in 16 of them, and there may be
-several in a short recording (Rousseeuw's minimum covariance determinant takes half, too).
+"""Fraction of the squared differences, the smallest, that is taken as noise: a step shows in 16 of them, and a short
+recording may have several (Rousseeuw's minimum covariance determinant takes half, too).
 """
 LOCAL_FRAMES = 384
 """Frames of the running medians: at 60 frames/s a few seconds, in which a creep is steady."""
@@ -74,12 +74,13 @@ def find(run: Run) -> list[FoundChange]:
     peaks, _ = signal.find_peaks(squared_changes(y), height=limit, distance=2 * SIDE_FRAMES)
     # The difference of two normal errors, as seldom, should every frame have a background of its own.
     least = 2.0 * float(stats.chi2.isf(chance, 6))
-    places = {_place(y, peak) for peak in peaks.tolist()}
-    return [
-        FoundChange(*good[[place.index, place.first, place.last]].tolist())
-        for place in sorted(places, key=lambda place: place.index)
-        if float((_jump(y, place.index) ** 2).sum()) > least
-    ]
+    places = sorted((_place(y, peak) for peak in peaks.tolist()), key=lambda place: place.index)
+    found: list[FoundChange] = []
+    for place in places:
+        apart = not found or place.index - found[-1].index >= SIDE_FRAMES
+        if apart and float((_jump(y, place.index) ** 2).sum()) > least:
+            found.append(place)
+    return [FoundChange(*good[[place.index, place.first, place.last]].tolist()) for place in found]
 
 
 def _jump(y: Array, index: int) -> Array:
