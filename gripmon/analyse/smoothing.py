@@ -120,13 +120,13 @@ class Smoothed:
 
 
 def smooth_blocks(blocks: Blocks) -> Smoothed:
-    """The smoothed blocks, by the likeliest walk of each axis."""
+    """The smoothed blocks, by the likeliest walk and lasting error of each axis."""
     tried = np.array([(factor, turn) for factor in SLOW_FACTORS for turn in TURNS_PER_S3])
     axes = blocks.mean.shape[1]
-    slow = (tried[:, :1] * blocks.slow).ravel()
-    turn = np.repeat(tried[:, 1], axes)
+    slow, turn = (tried[:, :1] * blocks.slow).ravel(), np.repeat(tried[:, 1], axes)
     y, variance = (np.tile(values, (1, len(tried))) for values in (blocks.mean, blocks.variance))
-    found = _filter(blocks.time_s, y, variance, blocks.restarts, slow, turn)[-1].reshape(len(tried), axes)
+    model = _Model(blocks.time_s, blocks.restarts, slow, turn)
+    found = model.filtered(y, variance).reshape(len(tried), axes)
     best = found.argmax(axis=0) * axes + np.arange(axes)
     return smooth(
         blocks.time_s, blocks.mean, blocks.variance, blocks.restarts, slow[best], turn[best], blocks.segment
@@ -140,52 +140,58 @@ def smooth(
 
     ``restarts`` (m,): x is unknown again from there on.  ``slow``, ``turn`` (a,): as in :class:`Smoothed`.
     """
-    transition, predicted, predicted_cov, mean, cov, log_likelihood = _filter(
-        time_s, y, variance, restarts, slow, turn
-    )
+    model = _Model(time_s, restarts, slow, turn)
+    steps: list[tuple[Array, ...]] = []
+    log_likelihood = model.filtered(y, variance, steps)
+    predicted, predicted_cov, mean, cov = (np.array(each) for each in zip(*steps, strict=True))
     # The regularisation makes a covariance of zero invertible; such a state needs no correction.
     inverse = np.linalg.inv(predicted_cov + 1e-12 * np.eye(3))
     for k in range(len(mean) - 2, -1, -1):
-        gain = cov[k] @ transition[k + 1].T @ inverse[k + 1]
+        gain = cov[k] @ model.transition[k + 1].T @ inverse[k + 1]
         mean[k] += (gain @ (mean[k + 1] - predicted[k + 1])[..., None])[..., 0]
         cov[k] += gain @ (cov[k + 1] - predicted_cov[k + 1]) @ np.swapaxes(gain, -1, -2)
     segment = np.cumsum(restarts) if segment is None else segment
     return Smoothed(time_s, segment, mean[..., 0], mean[..., 1], cov[..., :2, :2], slow, turn, log_likelihood)
 
 
-def _filter(
-    time_s: Array, y: Array, variance: Array, restarts: Bools, slow: Array, turn: Array
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Transitions (m, 3, 3) into each step, predicted and filtered means (m, a, 3) and covariances (m, a, 3, 3),
-    log-likelihood (a,).
-    """
-    steps, series = y.shape
-    elapsed = np.diff(time_s, prepend=time_s[0])
-    fade = np.exp(-elapsed / SLOW_S)
-    transition = np.tile(np.eye(3), (steps, 1, 1))
-    transition[:, 0, 1], transition[:, 2, 2] = elapsed, fade
-    t = elapsed[:, None]
-    added = np.zeros((steps, series, 3, 3))
-    added[..., 0, 0] = turn * t**3 / 3.0 + UNKNOWN_VARIANCE * restarts[:, None]
-    added[..., 0, 1] = added[..., 1, 0] = turn * t**2 / 2.0
-    added[..., 1, 1] = turn * t
-    added[..., 2, 2] = slow * (1.0 - fade[:, None] ** 2)
-    added[0, :, 0, 0], added[0, :, 1, 1] = UNKNOWN_VARIANCE, UNKNOWN_RATE_VARIANCE * (turn > 0.0)
-    added[0, :, 2, 2] = slow
-    predicted, predicted_cov = np.empty((steps, series, 3)), np.empty((steps, series, 3, 3))
-    filtered, filtered_cov = np.empty_like(predicted), np.empty_like(predicted_cov)
-    known: Bools = np.isfinite(variance) & np.isfinite(y)
-    noise, values = np.where(known, variance, 1.0), np.where(known, y, 0.0)
-    mean, cov, log_density = np.zeros((series, 3)), np.zeros((series, 3, 3)), np.zeros(series)
-    for k in range(steps):
-        mean = mean @ transition[k].T
-        cov = transition[k] @ cov @ transition[k].T + added[k]
-        predicted[k], predicted_cov[k] = mean, cov
-        towards = (cov[..., 0] + cov[..., 2]) * known[k][:, None]
-        expected = cov[:, 0, 0] + 2.0 * cov[:, 0, 2] + cov[:, 2, 2] + noise[k]
-        innovation = values[k] - mean[:, 0] - mean[:, 2]
-        mean = mean + towards * (innovation / expected)[:, None]
-        cov = cov - towards[:, :, None] * (towards / expected[:, None])[:, None, :]
-        log_density -= known[k] * (np.log(2.0 * np.pi * expected) + innovation * innovation / expected)
-        filtered[k], filtered_cov[k] = mean, cov
-    return transition, predicted, predicted_cov, filtered, filtered_cov, 0.5 * log_density
+class _Model:
+    """Pose, rate and lasting error: ``transition`` (m, 3, 3) into each step, and what is added there."""
+
+    def __init__(self, time_s: Array, restarts: Bools, slow: Array, turn: Array):
+        elapsed = np.diff(time_s, prepend=time_s[0])
+        fade = np.exp(-elapsed / SLOW_S)
+        self.transition = np.tile(np.eye(3), (len(time_s), 1, 1))
+        self._walk, self._lasting = np.zeros((2, len(time_s), 3, 3))
+        self.transition[:, 0, 1], self.transition[:, 2, 2] = elapsed, fade
+        self._walk[:, 0, 0], self._walk[:, 1, 1] = elapsed**3 / 3.0, elapsed
+        self._walk[:, 0, 1] = self._walk[:, 1, 0] = elapsed**2 / 2.0
+        self._lasting[:, 2, 2] = 1.0 - fade**2
+        self._restarts = restarts
+        self._slow, self._turn = slow[:, None, None], turn[:, None, None]
+
+    def filtered(
+        self, y: Array, variance: Array, steps: list[tuple[Array, ...]] | None = None
+    ) -> Array:
+        """Log-likelihood (a,) of series (m, a); to ``steps`` are added the predicted means (a, 3) and covariances
+        (a, 3, 3) and the filtered ones.
+        """
+        known: Bools = np.isfinite(variance) & np.isfinite(y)
+        noise, values = np.where(known, variance, 1.0), np.where(known, y, 0.0)
+        mean, log_density = np.zeros((y.shape[1], 3)), np.zeros(y.shape[1])
+        cov = self._slow * np.diag([0.0, 0.0, 1.0]) + np.diag([UNKNOWN_VARIANCE, 0.0, 0.0])
+        cov = cov + (self._turn > 0.0) * np.diag([0.0, UNKNOWN_RATE_VARIANCE, 0.0])
+        for k, move in enumerate(self.transition):
+            mean = mean @ move.T
+            cov = move @ cov @ move.T + self._turn * self._walk[k] + self._slow * self._lasting[k]
+            if self._restarts[k]:
+                cov[:, 0, 0] += UNKNOWN_VARIANCE
+            predicted, predicted_cov = mean, cov
+            towards = (cov[..., 0] + cov[..., 2]) * known[k][:, None]
+            expected = cov[:, 0, 0] + 2.0 * cov[:, 0, 2] + cov[:, 2, 2] + noise[k]
+            innovation = values[k] - mean[:, 0] - mean[:, 2]
+            mean = mean + towards * (innovation / expected)[:, None]
+            cov = cov - towards[:, :, None] * (towards / expected[:, None])[:, None, :]
+            log_density -= known[k] * (np.log(2.0 * np.pi * expected) + innovation * innovation / expected)
+            if steps is not None:
+                steps.append((predicted, predicted_cov, mean, cov))
+        return np.asarray(0.5 * log_density)
