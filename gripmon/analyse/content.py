@@ -329,8 +329,8 @@ def span(start_ns: int, end_ns: int) -> str:
 
 
 def millimetres(metres: float, sigma_m: float | None = None) -> str:
-    """``4.21 mm``: two standard deviations of the frames' noise determine the digits.  They aren't shown as ±: light and
-    bevels, which they leave out, may shift a measurement by more.
+    """``4.21 mm``: two standard deviations of the frames' noise determine the digits.  They aren't shown as ±: light
+    and bevels, which they leave out, may shift a measurement by more.
     """
     if not math.isfinite(metres):
         return "unknown"
