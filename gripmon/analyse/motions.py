@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from gripmon.analyse.affected import excess
 from gripmon.analyse.content import Displacement, Event, Limits, Moment, Onset
 from gripmon.analyse.correction import ChangePoint, correct
-from gripmon.analyse.events import MOTIONS, AlertHistory, TimedAlert, explained, probability, worst
+from gripmon.analyse.events import MOTIONS, AlertHistory, TimedAlert, annotation
 from gripmon.analyse.track import SECOND_NS, Track, displacement
 from gripmon.model.records import AlertKind, Array, Severity
 from gripmon.record.recordings import Recording
@@ -140,29 +140,16 @@ def _event(
     if at_once is not None:
         onset, kind = _onset_of(at_once), AlertKind.STEP
     moved, moved_in_s, at_rest_ns = _size(track, onset, until_ns, kind)
-    alert = explained(stretch.alerts)
-    assert alert is not None, "a stretch has alerts"
     rates = [each.alert.rate_m_per_min for each in stretch.alerts if each.alert.rate_m_per_min is not None]
-    over = stretch.over
     return Event(
         kind=kind,
         title=_TITLES[kind],
-        severity=worst(stretch.alerts),
         onset=onset,
-        noticed_ns=stretch.noticed_ns,
         end_ns=at_rest_ns,
-        end_text="" if over is None else over.alert.text,
-        cause=alert.cause,
-        cause_probability=probability(alert),
-        part=alert.part,
-        causes=alert.causes,
         moved=moved or _alerted_size(stretch),
         moved_in_s=moved_in_s,
         rate_m_per_min=rates[-1] if rates else None,
-        alert_id=alert.alert_id,
-        story=tuple(
-            Moment(s.stamp_ns, f"{s.alert.event}: {s.alert.text}") for s in (*stretch.alerts, *([over] if over else ()))
-        ),
+        **annotation(stretch.alerts, stretch.over),
     )
 
 
