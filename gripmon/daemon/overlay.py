@@ -38,6 +38,6 @@ def overlay(
     lines += [Line(line_px, _REFERENCE) for line_px in reference_px or ()]
     corners = [c for c in record.corners if c.uv_px is not None] if reference_px is None else []
     rings = [Marks(corner.uv_px, _CORNER if corner.used else _REFUSED, rings=True) for corner in corners]
-    grey = to_8_bit(image)
-    grey = cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY) if grey.ndim == 3 else grey
+    shown = to_8_bit(image)
+    grey: Image = cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY) if shown.ndim == 3 else shown
     return jpeg(grey, lines, rings, width_px, _QUALITY)
