@@ -140,6 +140,33 @@ def test_gross_errors_are_disbelieved_and_named():
     assert (np.abs(correction.cam_T_grip - clean.cam_T_grip)[:, :3, 3].max(axis=0) < 0.5 * SIGMA[:3]).all()
 
 
+def test_a_burst_of_wrong_frames_is_no_motion_that_stays():
+    """The most plausible wrong answer: eight frames in a row, all wrong alike, as when a cable crosses an edge."""
+    stream = Stream(1800, 12)
+    wrong = slice(900, 908)
+    stream.seen[wrong] = moved(stream.seen[wrong], np.tile([0.0, 4e-4, 0.0, 0.0, 0.0, 0.0], (8, 1)))
+    correction, clean = stream.correct(), Stream(1800, 12).correct()
+    assert not correction.change_points
+    assert {SOURCES[code] for code in correction.source[wrong]} == {"followed"}, "camera or not, it is told apart"
+    beside = np.r_[0:880, 930:1800]
+    away = np.abs(correction.cam_T_grip - clean.cam_T_grip)[beside, :3, 3]
+    assert (away.max(axis=0) < 0.1 * SIGMA[:3]).all()
+
+
+@pytest.mark.parametrize("period_s", [3.0, 8.0])
+def test_a_wobble_in_step_with_the_jaw_is_no_change(period_s: float):
+    """An error of the gripper's model that comes and goes with its opening: three standard deviations, in 0.4 s."""
+    frames = 3600
+    opening = np.clip(6.0 * np.sin(2.0 * np.pi * np.arange(frames) / 60.0 / period_s), -1.0, 1.0)
+    stream = Stream(frames, 13)
+    stream.seen = moved(stream.seen, opening[:, None] * np.array([0.0, 1.5 * SIGMA[1], 0.0, 0.0, 0.0, 0.0]))
+    correction = stream.correct()
+    assert not correction.change_points
+    error = difference(stream.true, correction.cam_T_grip)
+    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(correction.covariance), error)
+    assert (squares < stats.chi2.ppf(0.999, 6)).mean() > 0.95
+
+
 def test_a_change_in_a_gap_may_have_happened_at_any_moment_of_it():
     stream = Stream(1500, 6, step_at(1500, 700, 10.0 * STEP))
     stream.measured[600:800] = False

@@ -1,4 +1,6 @@
-"""The smoother against dense least squares over all unknowns, its likelihood against the joint density, the"""
+"""The smoother against the dense Gaussian posterior of all unknowns, its likelihood against the joint density, the
+chart of poses against matrix exponentials, and the statistic of changes against chi².
+"""
 
 from __future__ import annotations
 
@@ -7,17 +9,16 @@ from scipy import stats
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.quick_motion import SIDE_FRAMES, squared_changes
-from gripmon.analyse.smoothing import MID_S, SLOW_S, UNKNOWN_VARIANCE, Dynamics, log_likelihood, smooth
+from gripmon.analyse.change_points import SIDE_FRAMES, squared_changes
+from gripmon.analyse.smoothing import SLOW_S, UNKNOWN_RATE_VARIANCE, UNKNOWN_VARIANCE, smooth
 from gripmon.analyse.vectors import covariances_to_poses, covariances_to_vectors, to_poses, to_vectors
 
 RNG = np.random.default_rng(1)
 STEPS = 30
 TIME_S = np.cumsum(RNG.uniform(0.05, 0.6, STEPS))
-DYNAMICS = Dynamics(*(np.array(v) for v in ([0.4, 0.9], [0.2, 0.05], [1e-2, 1e-4], [1e-3, 1e-2], [1.0, 4.0])))
+SLOW, TURN = np.array([0.4, 0.9]), np.array([1e-3, 1e-2])
 VARIANCE = RNG.uniform(0.05, 0.5, (STEPS, 2))
 RESTARTS = np.isin(np.arange(STEPS), [11])
-KINKS = np.zeros(STEPS, bool)
 Y = np.cumsum(RNG.normal(size=(STEPS, 2)), axis=0) + RESTARTS.cumsum()[:, None] * 5.0
 
 
@@ -26,21 +27,19 @@ def dense(axis: int) -> tuple[np.ndarray, np.ndarray]:
     count = len(TIME_S)
     x, errors = np.zeros((count, count)), np.zeros((count, count))
     t = TIME_S - TIME_S[0]
-    wander, turn, rate = DYNAMICS.wander[axis], DYNAMICS.turn[axis], DYNAMICS.rate[axis]
     after = np.cumsum(RESTARTS)
     for i in range(count):
         for j in range(count):
             low, high = min(t[i], t[j]), max(t[i], t[j])
-            # A random walk, a rate that began with a variance, and a random walk's integral.
-            x[i, j] = UNKNOWN_VARIANCE + wander * low + rate * t[i] * t[j] + turn * low**2 * (3.0 * high - low) / 6.0
-            x[i, j] += UNKNOWN_VARIANCE * min(after[i], after[j])
-            gone = high - low
-            errors[i, j] = DYNAMICS.slow[axis] * np.exp(-gone / SLOW_S) + DYNAMICS.mid[axis] * np.exp(-gone / MID_S)
+            # A level, a rate that began with a variance, and a random walk's integral.
+            x[i, j] = UNKNOWN_VARIANCE * (1.0 + min(after[i], after[j])) + UNKNOWN_RATE_VARIANCE * t[i] * t[j]
+            x[i, j] += TURN[axis] * low**2 * (3.0 * high - low) / 6.0
+            errors[i, j] = SLOW[axis] * np.exp(-(high - low) / SLOW_S)
     return x, errors
 
 
-def test_smoothing_is_the_conditional_mean_of_the_joint_normal_distribution():
-    smoothed = smooth(TIME_S, Y, VARIANCE, RESTARTS, KINKS, DYNAMICS)
+def test_smoothing_is_the_gaussian_posterior():
+    smoothed = smooth(TIME_S, Y, VARIANCE, RESTARTS, SLOW, TURN)
     for axis in range(2):
         x, errors = dense(axis)
         measured = x + errors + np.diag(VARIANCE[:, axis])
@@ -48,6 +47,9 @@ def test_smoothing_is_the_conditional_mean_of_the_joint_normal_distribution():
         np.testing.assert_allclose(smoothed.x[:, axis], gain @ Y[:, axis], atol=2e-5)
         spread = np.diag(x - gain @ x)
         np.testing.assert_allclose(smoothed.covariance[:, axis, 0, 0], spread, rtol=1e-4, atol=1e-5)
+        square = Y[:, axis] @ np.linalg.solve(measured, Y[:, axis])
+        expected = -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * measured)[1])
+        np.testing.assert_allclose(smoothed.log_likelihood[axis], expected, rtol=1e-5)
 
 
 def test_what_was_not_measured_tells_nothing():
@@ -55,29 +57,16 @@ def test_what_was_not_measured_tells_nothing():
     variance[5:9], y[7] = np.inf, np.nan
     kept = np.ones(STEPS, bool)
     kept[5:9] = False
-    part = smooth(TIME_S, y, variance, RESTARTS, KINKS, DYNAMICS)
-    alone = smooth(TIME_S[kept], Y[kept], VARIANCE[kept], RESTARTS[kept], KINKS[kept], DYNAMICS)
+    part = smooth(TIME_S, y, variance, RESTARTS, SLOW, TURN)
+    alone = smooth(TIME_S[kept], Y[kept], VARIANCE[kept], RESTARTS[kept], SLOW, TURN)
     np.testing.assert_allclose(part.x[kept], alone.x, atol=1e-6)
     np.testing.assert_allclose(part.covariance[kept], alone.covariance, rtol=1e-4, atol=1e-6)
 
 
-def test_the_likelihood_is_the_joint_density():
-    found = log_likelihood(TIME_S, Y, VARIANCE, RESTARTS, KINKS, DYNAMICS)
-    for axis in range(2):
-        x, errors = dense(axis)
-        covariance = x + errors + np.diag(VARIANCE[:, axis])
-        expected = stats.multivariate_normal(np.zeros(STEPS), covariance).logpdf(Y[:, axis])
-        np.testing.assert_allclose(found[axis], expected, rtol=1e-5)
-
-
-def test_a_kink_lets_the_rate_go():
-    time_s = np.arange(100) * 0.5
-    y = np.maximum(time_s - 25.0, 0.0)[:, None]
-    still = Dynamics(*(np.array([v]) for v in (0.1, 0.1, 1e-9, 1e-9, 1e-9)))
-    variance, none = np.full((100, 1), 0.01), np.zeros(100, bool)
-    kinks = np.isin(np.arange(100), [50])
-    stiff, kinked = (smooth(time_s, y, variance, none, k, still).x[:, 0] for k in (none, kinks))
-    assert np.abs(kinked - y[:, 0]).max() < 0.1 < np.abs(stiff - y[:, 0]).max()
+def test_a_pose_that_stands_still_is_one_number():
+    smoothed = smooth(TIME_S, Y, VARIANCE, np.zeros(STEPS, bool), SLOW, np.zeros(2))
+    assert np.ptp(smoothed.x, axis=0).max() < 1e-6 and np.abs(smoothed.rate).max() < 1e-9
+    assert (np.ptp(smoothed.covariance[:, :, 0, 0], axis=0) < 1e-6).all()
 
 
 def test_vectors_and_poses_are_each_others_way_back():
@@ -105,8 +94,7 @@ def test_covariances_follow_the_chart():
 
 def test_squared_changes_of_normal_noise_have_the_distribution_that_they_are_judged_by():
     noise = np.random.default_rng(5).normal(size=(40_000, 6)) @ np.random.default_rng(6).normal(size=(6, 6))
-    for length in SIDE_FRAMES:
-        squares = squared_changes(noise, length)[length:-length]
-        for chance in (0.5, 0.1, 0.01):
-            assert np.mean(squares > stats.chi2.isf(chance, 6)) < 1.35 * chance
-        assert np.median(squares) > 0.75 * stats.chi2.median(6)
+    squares = squared_changes(noise)[SIDE_FRAMES:-SIDE_FRAMES]
+    for chance in (0.5, 0.1, 0.01):
+        assert np.mean(squares > stats.chi2.isf(chance, 6)) < 1.35 * chance
+    assert np.median(squares) > 0.75 * stats.chi2.median(6)

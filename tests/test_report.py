@@ -424,10 +424,10 @@ def test_a_drift_that_was_one_step_is_placed_at_its_change_point():
     recording = only(Run(run))
     (event,) = recording.events
     assert event.kind == "step" and event.onset.found_by == "hindsight"
-    assert abs(event.onset.stamp_ns - (START_NS + 200 * PERIOD_NS)) <= 2 * PERIOD_NS
+    assert abs(event.onset.stamp_ns - (START_NS + 200 * PERIOD_NS)) <= 0.4 * SECOND_NS, "frames are wild until 260"
     assert event.moved.size_m == pytest.approx(9e-4, rel=0.2)
     (old,) = [a for a in recording.affected if a.what == "old_calibration"]
-    assert old.start_ns == event.onset.stamp_ns and "it moved at once" in recording.summary
+    assert event.onset.earliest_ns <= old.start_ns <= event.onset.latest_ns and "it moved at once" in recording.summary
 
 
 def test_a_drift_that_takes_its_time_stays_one_and_its_times_off_do_not_overlap():
@@ -453,6 +453,40 @@ def test_a_motion_has_pictures_before_it_at_it_and_after_it():
         run.records[i] = msgspec.structs.replace(run.records[i], verdict=Verdict.SUSPECT)
     (event,) = only(run).events
     assert (event.before_seq, event.at_seq, event.after_seq) == (240, 250, 290)
+
+
+def test_missing_frames_are_said_first_and_count_as_not_valid():
+    """27 of 1,188 frames, all valid: neither "valid 100 %" nor nothing said."""
+    run = stepped(n=1188, at=600)
+    run.records[:] = [run.records[i] for i in sorted({*range(0, 1188, 46), 1187})]
+    recording = only(run)
+    assert len(run.records) == 27 and recording.running.frames_dropped == 1161
+    assert recording.summary.startswith("Only 27 of 1188 frames were measured (1161 missing): the figures mean little.")
+    assert recording.integrity.valid == pytest.approx(27 / 1188)
+    report, told = build([run])
+    assert "Valid, of all frames 2.3 %" in text_of(page(report, told)) and "27 frames of 1188" in text_of(
+        page(report, told)
+    )
+    few = stepped(n=1000)
+    del few.records[300:303]
+    assert only(few).summary.startswith("3 frames (0.3 %) are missing. The camera")
+
+
+def test_a_size_has_no_uncertainty_that_leaves_light_and_bevels_out():
+    report, told = build([stepped()])
+    assert "±" not in text_of(page(report, told)) and "±" not in report.summary
+    assert report.recordings[0].events[0].moved.sigma_m is not None, "the frames' noise is in the data"
+
+
+def test_the_picture_of_a_creep_shows_it():
+    t = np.arange(1000) / FPS
+    shifts_m = np.zeros((1000, 3))
+    shifts_m[:, 1] = np.clip(t - 5.0, 0.0, 6.0) * 2e-4
+    run = records(shifts_m)
+    said(run, 400, kind=AlertKind.CREEP)
+    (event,) = only(Run(run, image_seqs=np.arange(0, 1000, 10))).events
+    way = [shifts_m[seq, 1] for seq in (event.before_seq, event.at_seq, event.after_seq)]
+    assert way[0] < 5e-5 and 0.45 * way[2] < way[1] < 0.65 * way[2]
 
 
 def test_what_is_not_used_is_not_shown_in_green():

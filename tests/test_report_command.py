@@ -156,6 +156,16 @@ def test_the_page_works_in_a_browser_without_a_network(reported: tuple[Path, Rep
         browser.set_window_size(width_px, 900)
         wait.until(lambda b, w=wide: all(now < then for now, then in zip(b.execute_script(widths), w, strict=True)))
     assert browser.execute_script(heights) == before
+    # On a telephone nothing but tables is wider than the window.
+    metrics = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    beyond = (
+        "return [...document.querySelectorAll('main *')].filter((e) => !e.closest('.scroll, svg, .js-plotly-plot')"
+        " && e.getBoundingClientRect().right > 391).map((e) => e.outerHTML.slice(0, 80))"
+    )
+    wait.until(lambda b: b.execute_script("return window.innerWidth") == 390)
+    wait.until(lambda b: max(b.execute_script(widths)) < 390)
+    assert browser.execute_script(beyond) == []
     for button in browser.find_elements(By.CSS_SELECTOR, ".modebar-btn"):
         assert "cloud" not in (button.get_attribute("data-title") or "").lower()
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]

@@ -221,12 +221,13 @@ def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:
         return None
     position_m, rotation_rad = table.protection_m[known], table.protection_rad[known]
     within = (position_m <= limits.alert_limit_m) & (rotation_rad <= limits.alert_limit_rad)
+    total = int(table.seq[-1] - table.seq[0]) + 1
     median_m, p99_m = np.percentile(position_m, (50.0, 99.0)).tolist()
     median_rad, p99_rad = np.percentile(rotation_rad, (50.0, 99.0)).tolist()
     return Integrity(
         frames=int(known.sum()),
-        valid=float(np.mean(table.verdict == table.VERDICTS.index("valid"))),
-        within=float(within.sum() / len(table)),
+        valid=float((table.verdict == table.VERDICTS.index("valid")).sum() / total),
+        within=float(within.sum() / total),
         median_m=median_m,
         p99_m=p99_m,
         median_rad=median_rad,

@@ -26,7 +26,7 @@ from gripmon.analyse.content import (
     count,
 )
 from gripmon.analyse.events import MOTIONS, alert_events, histories_of, pauses_of, reference_changes
-from gripmon.analyse.motions import change_points_of, motions_of, robust_sigma, unreported
+from gripmon.analyse.motions import change_points_of, motions_of, robust_sigma
 from gripmon.analyse.summary import headline, paragraph
 from gripmon.analyse.track import SECOND_NS, Clock, Track, curves_of, displacement, make_track, straightened
 from gripmon.model.geometry import from_record, perturbation_between, to_vector
@@ -79,8 +79,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
     histories = histories_of(source.alerts, clock)
     alerted_ns = [one.stamp_ns for history in histories if history.is_motion for one in history.alerts]
     points = change_points_of(source, track, alerted_ns, limits)
-    motions = motions_of(track, histories, points)
-    motions += unreported(points, motions, limits)
+    motions = motions_of(track, histories, points, limits)
     events = [*motions, *alert_events(histories), *pauses_of(clock)]
     events += reference_changes(events, source.references, in_force_ns)
     affected = motion_ranges(track, list(keys), motions, limits)
@@ -155,17 +154,17 @@ def _numbered(events: Sequence[Event], source: Recording, track: Track) -> tuple
 
 
 def _picture_seqs(event: Event, source: Recording, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
-    """The last picture before it began, preferably with the gripper measured; the first one in it; and the first valid
-    one after it, if it is over.
+    """The last picture before it began, preferably with the gripper measured; the first one that shows it, of a slow
+    motion with half of the way; and the first valid one after it, if it is over.  All of them differ.
     """
     if event.kind not in _SEEN:
         return {}
     table, stamps_ns = source.frames, track.stamp_ns[images]
     motion = event.kind in MOTIONS
     before = images[stamps_ns <= event.onset.earliest_ns] if motion else images[stamps_ns < event.onset.stamp_ns]
-    begun_ns = event.onset.stamp_ns if motion else event.noticed_ns or event.onset.stamp_ns
+    begun_ns = _half_way_ns(event, track) if motion else event.noticed_ns or event.onset.stamp_ns
     over_ns = max(event.onset.latest_ns, event.end_ns or 0) if motion else event.end_ns
-    at = images[stamps_ns >= begun_ns]
+    at = images[(stamps_ns >= begun_ns) & (stamps_ns > event.onset.earliest_ns)]
     after = images[stamps_ns >= (np.iinfo(np.int64).max if over_ns is None else over_ns)]
     valid = table.verdict[after] == table.VERDICTS.index(Verdict.VALID)
     found: dict[str, int] = {}
@@ -177,9 +176,24 @@ def _picture_seqs(event: Event, source: Recording, track: Track, images: NDArray
         chosen = next((choice for choice in choices if choice.size), None)
         if chosen is not None:
             found[name] = _with_overlay(source, track.seq[chosen])
-    if found.get("at_seq") == found.get("after_seq"):
-        found.pop("at_seq", None)
+    for name in ("after_seq", "before_seq"):
+        if found.get("at_seq") == found.get(name):
+            found.pop("at_seq", None)
     return found
+
+
+def _half_way_ns(event: Event, track: Track) -> int:
+    """When half of a motion's way was behind it: at once, for a step."""
+    onset_ns = event.onset.stamp_ns
+    if event.kind == AlertKind.STEP or event.moved is None or event.end_ns is None:
+        return onset_ns
+    during = np.flatnonzero(track.measured & (track.stamp_ns >= onset_ns) & (track.stamp_ns <= event.end_ns))
+    way = np.array(event.moved.tcp_shift_m)
+    if not during.size or not way.any():
+        return onset_ns
+    along = (track.against_first[during, :3] - track.against_first[during[0], :3]) @ way
+    beyond = np.flatnonzero(along >= 0.5 * float(way @ way))
+    return int(track.stamp_ns[during[beyond[0]]]) if beyond.size else onset_ns
 
 
 def _with_overlay(source: Recording, seqs: NDArray[np.int64]) -> int:

@@ -27,9 +27,11 @@ class Displacement(msgspec.Struct, frozen=True):
 
     tcp_shift_m: Annotated[Vector, _is("of the TCP along the camera's x, y, z, m")]
     size_m: Annotated[float, _is("length of tcp_shift_m")]
-    sigma_m: Annotated[float | None, _is("standard deviation of size_m; null: not known")]
+    sigma_m: Annotated[
+        float | None, _is("standard deviation of size_m by frames' noise, without light and bevels; null: not known")
+    ]
     rotation_rad: Annotated[float | None, _is("turn, rad; null: not known")]
-    rotation_sigma_rad: Annotated[float | None, _is("standard deviation of rotation_rad")] = None
+    rotation_sigma_rad: Annotated[float | None, _is("standard deviation of rotation_rad, likewise")] = None
 
 
 class Onset(msgspec.Struct, frozen=True):
@@ -120,8 +122,8 @@ class Integrity(msgspec.Struct, frozen=True, kw_only=True):
     """How large errors may have been, frame by frame, and how often that was within the alert limits."""
 
     frames: Annotated[int, _is("that have bounds: those with a transform")]
-    valid: Annotated[float, _is("share of all frames whose transform was valid, 0 to 1")]
-    within: Annotated[float, _is("share of all frames with both bounds within the alert limits, 0 to 1")]
+    valid: Annotated[float, _is("share of all frames, missing ones too, whose transform was valid, 0 to 1")]
+    within: Annotated[float, _is("share of all frames, likewise, with both bounds within the alert limits, 0 to 1")]
     median_m: Annotated[float, _is("median of the bounds on the TCP's position error")]
     p99_m: Annotated[float, _is("99 % of them are at most that")]
     median_rad: Annotated[float, _is("median of the bounds on the rotation error")]
@@ -270,7 +272,7 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
 
 
 COVERAGE = 2.0
-"""Standard deviations that ± denotes."""
+"""Standard deviations of a frame's noise that count as significant and make the curves' bands."""
 
 
 _FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
@@ -327,14 +329,16 @@ def span(start_ns: int, end_ns: int) -> str:
 
 
 def millimetres(metres: float, sigma_m: float | None = None) -> str:
-    """``4.21 ± 0.02 mm``: ± is two standard deviations and determines the digits."""
+    """``4.21 mm``: two standard deviations of the frames' noise determine the digits.  They aren't shown as ±: light
+    and bevels, which they leave out, may shift a measurement by more.
+    """
     if not math.isfinite(metres):
         return "unknown"
     return f"{_measured(1e3 * metres, None if sigma_m is None else 1e3 * sigma_m)} mm"
 
 
 def degrees(radians: float | None, sigma_rad: float | None = None) -> str:
-    """``1.63 ± 0.04°``."""
+    """``1.63°``, digits as :func:`millimetres`."""
     if radians is None or not math.isfinite(radians):
         return "unknown"
     sigma = None if sigma_rad is None else math.degrees(sigma_rad)
@@ -374,9 +378,5 @@ def count(number: int, one: str) -> str:
 def _measured(value: float, sigma: float | None) -> str:
     if sigma is None or not math.isfinite(sigma) or sigma <= 0.0:
         return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-    spread = COVERAGE * sigma
-    digits = min(max(1 - math.floor(math.log10(spread)), 0), 4) if spread < 10.0 else 0
-    digits = (
-        digits - 1 if digits > 1 and round(spread, digits - 1) > 0.0 and spread * 10 ** (digits - 1) >= 2.0 else digits
-    )
-    return f"{value:.{digits}f} ± {spread:.{digits}f}"
+    digits = -math.floor(math.log10(COVERAGE * sigma))  # the spread's first digit is the last one shown
+    return f"{value:.{min(max(digits, 0), 4)}f}"

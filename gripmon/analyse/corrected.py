@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,15 +15,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
+from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR
 from gripmon.analyse.content import clock_time, count
-from gripmon.analyse.correction import BLOCK_S, SOURCES, Correction, correct, sample
-from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
-from gripmon.analyse.smoothing import MID_S, SLOW_S
+from gripmon.analyse.correction import SOURCES, Correction, correct, sample
+from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array, Origin, Transform
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
+_POSE = [f"translation_{axis}_m" for axis in "xyz"], [f"rotation_{axis}" for axis in "xyzw"]
 BETWEEN = "between"
 """Source of an instant that is not a frame's."""
 
@@ -126,22 +126,9 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
     sigma_tcp_m: float
 
 
-def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
-    """The provenance of a file."""
-    settings = {
-        "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
-        "block_s": BLOCK_S,
-        "slow_error_s": SLOW_S,
-        "mid_error_s": MID_S,
-    }
-    return Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
-
-
 def _run(each: CorrectedRun) -> WrittenRun:
     recording, made = each.recording, each.correction
     seqs = recording.frames.seq
-    learnt = {name: getattr(made.learnt, name) for name in ("white", "mid", "slow", "frame", "unseen")}
-    learnt |= {"wander_per_s": made.dynamics.wander, "turn_per_s3": made.dynamics.turn}
     return WrittenRun(
         recording.recording_id,
         recording.robot,
@@ -159,37 +146,41 @@ def _run(each: CorrectedRun) -> WrittenRun:
             )
             for point in made.change_points
         ),
-        {name: tuple(values.tolist()) for name, values in learnt.items()},
+        {name: tuple(values.tolist()) for name, values in made.learnt.items()},
         (*recording.faults, *made.faults),
     )
 
 
-def _columns(each: CorrectedRun) -> dict[str, Any]:
-    """One run's instants: arrays, with the sources as text."""
+def _table(number: int, each: CorrectedRun) -> pa.Table:
+    """One run's instants."""
     made, frames = each.correction, each.recording.frames
     if each.wanted_ns is None:
-        stamp_ns, seq, segment, poses, covariance = (
-            made.stamp_ns, frames.seq, made.segment, made.cam_T_grip, made.covariance
-        )  # fmt: skip
-        source = [SOURCES[code] for code in made.source.tolist()]
+        stamp_ns, seq, segment = made.stamp_ns, frames.seq, made.segment
+        poses, covariance = made.cam_T_grip, made.covariance
+        source = np.array(SOURCES, object)[made.source]
     else:
         stamp_ns = each.wanted_ns
         poses, covariance, segment = sample(made, stamp_ns)
         at = np.minimum(np.searchsorted(made.stamp_ns, stamp_ns), len(made.stamp_ns) - 1)
         own = made.stamp_ns[at] == stamp_ns
         seq = np.where(own, frames.seq[at], -1)
-        codes = made.source[at].tolist()
-        source = [SOURCES[code] if mine else BETWEEN for code, mine in zip(codes, own.tolist(), strict=True)]
-    return {
-        "seq": seq,
-        "stamp_ns": stamp_ns,
-        "segment": segment,
-        "source": source,
-        "sigma_tcp_m": _tcp_sigma_m(covariance),
-        "translation_m": poses[:, :3, 3],
-        "rotation_xyzw": Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True),
-        "covariance": covariance.reshape(-1, 36),
-    }
+        source = np.where(own, np.array(SOURCES, object)[made.source[at]], BETWEEN)
+    turn = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    return pa.table(
+        {
+            "run": np.full(len(seq), number, np.int32),
+            "robot": pa.array([each.recording.robot] * len(seq), pa.string()),
+            "camera": pa.array([each.recording.camera] * len(seq), pa.string()),
+            "seq": seq,
+            "stamp_ns": stamp_ns,
+            "segment": segment,
+            "source": pa.array(source.tolist(), pa.string()),
+            "sigma_tcp_m": _tcp_sigma_m(covariance),
+            **{f"translation_{axis}_m": np.ascontiguousarray(poses[:, k, 3]) for k, axis in enumerate("xyz")},
+            **{f"rotation_{axis}": np.ascontiguousarray(turn[:, k]) for k, axis in enumerate("xyzw")},
+            "covariance": pa.FixedSizeListArray.from_arrays(pa.array(covariance.reshape(-1)), 36),
+        }
+    )
 
 
 def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]], number: int = 0) -> None:
@@ -198,7 +189,8 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
     ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
     """
     part = path.with_name(f".{path.name}.part")
-    about = provenance(runs, inputs)
+    settings = {"false_alarms_per_hour": FALSE_ALARMS_PER_HOUR, "block_s": BLOCK_S, "slow_error_s": SLOW_S}
+    about = Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
     try:
         if path.suffix.lower() == ".jsonl":
             _write_jsonl(part, runs, about)
@@ -222,37 +214,16 @@ def _write_jsonl(path: Path, runs: Sequence[CorrectedRun], about: Provenance) ->
     encode = msgspec.json.Encoder().encode
     with path.open("wb") as file:
         file.write(encode(about) + b"\n")
-        for run, each in enumerate(runs):
-            columns = _columns(each)
-            rows = (columns[name] if name == "source" else columns[name].tolist() for name in columns)
-            for seq, stamp_ns, segment, source, sigma_tcp_m, translation_m, rotation_xyzw, covariance in zip(
-                *rows, strict=True
-            ):
-                transform = Transform(tuple(translation_m), tuple(rotation_xyzw))
-                frame = CorrectedFrame(run, seq, stamp_ns, transform, tuple(covariance), segment, source, sigma_tcp_m)
-                file.write(encode(frame) + b"\n")
+        for number, each in enumerate(runs):
+            for batch in _table(number, each).to_batches(4096):
+                for row in batch.to_pylist():
+                    shift, turn = ([row.pop(name) for name in names] for names in _POSE)
+                    row |= {"cam_T_grip": Transform(tuple(shift), tuple(turn)), "covariance": tuple(row["covariance"])}
+                    del row["robot"], row["camera"]
+                    file.write(encode(CorrectedFrame(**row)) + b"\n")
 
 
 def _write_parquet(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
     """The same as a table, the covariance as a list of 36 (m², m rad, rad²), :class:`Provenance` as metadata."""
     whole = pa.concat_tables([_table(number, each) for number, each in enumerate(runs)])
     pq.write_table(whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)}), path, compression="zstd")
-
-
-def _table(number: int, each: CorrectedRun) -> pa.Table:
-    columns = _columns(each)
-    count = len(columns["source"])
-    plain = {name: columns[name] for name in ("seq", "stamp_ns", "segment", "source", "sigma_tcp_m")}
-    parts = [(f"translation_{axis}_m", columns["translation_m"][:, k]) for k, axis in enumerate("xyz")]
-    parts += [(f"rotation_{axis}", columns["rotation_xyzw"][:, k]) for k, axis in enumerate("xyzw")]
-    return pa.table(
-        {
-            "run": np.full(count, number, np.int32),
-            "robot": pa.array([each.recording.robot] * count, pa.string()),
-            "camera": pa.array([each.recording.camera] * count, pa.string()),
-            **plain,
-            "source": pa.array(columns["source"], pa.string()),
-            **{name: np.ascontiguousarray(values) for name, values in parts},
-            "covariance": pa.FixedSizeListArray.from_arrays(pa.array(columns["covariance"].ravel()), 36),
-        }
-    )

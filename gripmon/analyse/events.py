@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,27 +40,36 @@ def _event(history: AlertHistory) -> Event:
     # It is named after its most severe stage: occluded, then lost, is lost.
     gravest = worst(alerts)
     kind = [each.alert.kind for each in alerts if each.alert.severity == gravest][-1]
-    alert = explained(alerts) or alerts[-1].alert
     since_ns = history.since_ns
     noted = not history.first.alert.alert_id
-    end_ns = history.first.stamp_ns if noted else None if history.over is None else history.over.stamp_ns
     return Event(
         kind=kind,
         title=TITLES.get(kind, str(kind).replace("_", " ").capitalize()),
-        severity=gravest,
         onset=Onset(since_ns, since_ns, since_ns, "alert"),
-        noticed_ns=history.first.stamp_ns,
-        end_ns=end_ns,
-        end_text="" if history.over is None else history.over.alert.text,
-        cause=alert.cause,
-        cause_probability=probability(alert),
-        part=alert.part,
-        causes=alert.causes,
-        alert_id=alert.alert_id,
-        story=tuple(
-            Moment(a.stamp_ns, a.alert.text if noted else f"{a.alert.event}: {a.alert.text}") for a in history.all
-        ),
+        end_ns=history.first.stamp_ns if noted else None if history.over is None else history.over.stamp_ns,
+        **annotation(alerts, history.over),
     )
+
+
+def annotation(alerts: Sequence[TimedAlert], over: TimedAlert | None) -> dict[str, Any]:
+    """What alerts say of an event: severity, cause, story; ``over``: the one that cleared it."""
+    alert = _explained(alerts)
+    named = [c.probability for c in alert.causes if (c.cause, c.part) == (alert.cause, alert.part)]
+    stages = alerts if over is None or over in alerts else (*alerts, over)
+    return {
+        "severity": worst(alerts),
+        "noticed_ns": alerts[0].stamp_ns,
+        "end_text": "" if over is None else over.alert.text,
+        "cause": alert.cause,
+        "cause_probability": named[0] if named else None,
+        "part": alert.part,
+        "causes": alert.causes,
+        "alert_id": alert.alert_id,
+        "story": tuple(
+            Moment(at_ns, f"{each.event}: {each.text}" if alerts[0].alert.alert_id else each.text)
+            for at_ns, each in stages
+        ),
+    }
 
 
 def pauses_of(clock: Clock) -> list[Event]:
@@ -176,14 +185,8 @@ def worst(alerts: Sequence[TimedAlert]) -> Severity:
     return max((each.alert.severity for each in alerts), key=list(Severity).index, default=Severity.INFO)
 
 
-def explained(alerts: Sequence[TimedAlert]) -> AlertRecord | None:
+def _explained(alerts: Sequence[TimedAlert]) -> AlertRecord:
     """The last one that names a cause; else the last one with weighed causes; else the last."""
     records = [each.alert for each in reversed(alerts)]
-    named = (record for record in records if record.cause != Cause.UNKNOWN)
-    weighed = (record for record in records if record.causes)
-    return next(named, None) or next(weighed, None) or next(iter(records), None)
-
-
-def probability(alert: AlertRecord) -> float | None:
-    """Probability of the cause that it names."""
-    return next((c.probability for c in alert.causes if (c.cause, c.part) == (alert.cause, alert.part)), None)
+    named = [record for record in records if record.cause != Cause.UNKNOWN]
+    return [*named, *(record for record in records if record.causes), *records][0]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +30,7 @@ from gripmon.analyse.content import (
     span,
 )
 from gripmon.analyse.events import MOTIONS
+from gripmon.analyse.overlay import Colour, Line, Marks, jpeg
 from gripmon.analyse.summary import CAUSES, cause_words
 from gripmon.model.records import AlertKind, CauseWeight, Origin
 from gripmon.record.recorder import to_8_bit
@@ -133,7 +133,7 @@ def _index(analysed: AnalysedRecording, seq: int) -> int:
 
 def _with_units(text: str) -> str:
     """Keep a number and its unit on one line."""
-    return re.sub(r"(?<=[\d>]) (?=(?:±|mm|ms|s|min|h|d|%|\d)(?:\W|\d|$))", "\u00a0", re.sub("± ", "±\u00a0", text))
+    return re.sub(r"(?<=[\d>]) (?=(?:mm|ms|s|min|h|d|%|\d)(?:\W|\d|$))", "\u00a0", text)
 
 
 def _times_moved(report: RecordingReport) -> str:
@@ -208,14 +208,12 @@ _WIDTH_PX = 560  # of a picture on the page
 _MARGIN = 0.18  # of the gripper's size, around it
 _SMALLEST = 0.35  # of the image's width: a smaller part doesn't show the scene
 _JPEG_QUALITY = 82
-_SUBPIXEL_BITS = 4
-_BGR = tuple[int, int, int]
 Points = NDArray[np.float32]
-PREDICTED: _BGR = (255, 200, 60)
-USED: _BGR = (120, 235, 70)
-REFUSED: _BGR = (70, 70, 255)
-CORNER: _BGR = (60, 225, 255)
-BEFORE: _BGR = (255, 255, 255)
+PREDICTED: Colour = (255, 200, 60)
+USED: Colour = (120, 235, 70)
+REFUSED: Colour = (70, 70, 255)
+CORNER: Colour = (60, 225, 255)
+BEFORE: Colour = (255, 255, 255)
 
 
 class JudgedPicture(NamedTuple):
@@ -275,35 +273,12 @@ def _box(points: Sequence[Points], width: int, height: int) -> tuple[int, int, i
 def _shown(judged: JudgedPicture, box: tuple[int, int, int, int], outline: Sequence[Points]) -> ShownPicture | None:
     left, top, right, bottom = box
     picture, used = judged
-    image = to_8_bit(picture.image)
-    crop = (cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)[top:bottom, left:right]
-    if not crop.size:
+    lines = [Line(strip, BEFORE, 2) for strip in outline]
+    lines += [Line(strip, PREDICTED) for strip in picture.predicted_edges]
+    marks = [Marks(picture.edges_used, USED if used else REFUSED), Marks(picture.edges_refused, REFUSED)]
+    marks += [Marks(_corners(picture), CORNER, rings=True)] if used else []
+    if not to_8_bit(picture.image)[top:bottom, left:right].size:
         return None
-    scale = _WIDTH_PX / (right - left)
-    size = (_WIDTH_PX, max(round(scale * (bottom - top)), 1))
-    canvas = cv2.resize(crop, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
-
-    def place(points: Points) -> NDArray[np.int32]:
-        """The first pixel's centre is at 0 in both images."""
-        moved = (points.reshape(-1, 2) - (left, top) + 0.5) * scale - 0.5
-        moved = moved[np.isfinite(moved).all(axis=1) & (np.abs(moved) < 1e5).all(axis=1)]
-        return np.round(moved * 2**_SUBPIXEL_BITS).astype(np.int32)
-
-    for strips, colour, thickness in ((outline, BEFORE, 2), (picture.predicted_edges, PREDICTED, 1)):
-        polylines = [place(strip) for strip in strips]
-        cv2.polylines(
-            canvas, [p for p in polylines if len(p) > 1], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
-        )
-    for points, colour, radius in (
-        (picture.edges_used, USED if used else REFUSED, 2),
-        (picture.edges_refused, REFUSED, 2),
-        (_corners(picture)[: None if used else 0], CORNER, 5),
-    ):
-        for x, y in place(points).tolist():
-            filled = -1 if radius < 5 else 2
-            cv2.circle(canvas, (x, y), radius << _SUBPIXEL_BITS, colour, filled, cv2.LINE_AA, _SUBPIXEL_BITS)
-    done, encoded = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
-        return None
-    text = base64.b64encode(encoded.tobytes()).decode("ascii")
-    return ShownPicture(int(picture.seq), f"data:image/jpeg;base64,{text}", *size)
+    text = base64.b64encode(jpeg(to_8_bit(picture.image), lines, marks, _WIDTH_PX, _JPEG_QUALITY, box)).decode("ascii")
+    height_px = max(round(_WIDTH_PX / (right - left) * (bottom - top)), 1)
+    return ShownPicture(int(picture.seq), f"data:image/jpeg;base64,{text}", _WIDTH_PX, height_px)

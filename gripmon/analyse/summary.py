@@ -65,7 +65,7 @@ def paragraph(report: RecordingReport) -> str:
 
 
 def _too_few(report: RecordingReport) -> str:
-    """What the reader must know before anything else."""
+    """What the reader must know before anything else: that frames are missing, or weren't measured."""
     running = report.running
     dropped = min(running.monitor_dropped or 0, running.frames_dropped)
     text = too_few(
@@ -74,7 +74,20 @@ def _too_few(report: RecordingReport) -> str:
         missing=running.frames_dropped - dropped,
         unmeasured=running.frames_refused,
     )
-    return f"{text[0].upper()}{text[1:]}." if text else ""
+    return " ".join(f"{part[0].upper()}{part[1:]}." for part in (text, _missing(report)) if part)
+
+
+def _missing(report: RecordingReport) -> str:
+    """``100 frames (20 %) are missing (the monitor was too busy for 90)``; empty if none is."""
+    running = report.running
+    if not running.frames_dropped:
+        return ""
+    share = percent(running.frames_dropped / (running.frames + running.frames_dropped))
+    known = ((running.monitor_dropped, "the monitor"), (running.recording_dropped, "the recorder"))
+    reasons = [f"{who} was too busy for {number}" for number, who in known if number]
+    are = "is missing" if running.frames_dropped == 1 else "are missing"
+    why = f" ({_and(reasons)})" if reasons else ""
+    return f"{count(running.frames_dropped, 'frame')} ({share}) {are}{why}"
 
 
 def headline(report: RecordingReport) -> str:
@@ -177,22 +190,12 @@ def _lost(report: RecordingReport) -> str:
         parts.append(f"for {duration(total_s['unknown'])} there was no transform")
     if total_s["suspect"]:
         parts.append(f"for {duration(total_s['suspect'])} it was only suspect")
-    if running.frames_dropped:
-        share = percent(running.frames_dropped / (running.frames + running.frames_dropped))
-        parts.append(f"{count(running.frames_dropped, 'frame')} ({share}) {_why_missing(report)}")
     if running.gaps:
         parts.append(f"{count(running.gaps, 'pause')} without frames, the longest {duration(running.longest_gap_s)}")
     if not parts:
-        all_valid = [share.name for share in running.verdicts] == ["valid"]
-        return "Nothing was lost: every frame has a valid transform." if all_valid else ""
+        whole = [share.name for share in running.verdicts] == ["valid"] and not running.frames_dropped
+        return "Nothing was lost: every frame has a valid transform." if whole else ""
     return f"Lost: {_and(parts)}."
-
-
-def _why_missing(report: RecordingReport) -> str:
-    are = "is missing" if report.running.frames_dropped == 1 else "are missing"
-    known = ((report.running.monitor_dropped, "the monitor"), (report.running.recording_dropped, "the recorder"))
-    reasons = [f"{who} was too busy for {number}" for number, who in known if number]
-    return f"{are} ({_and(reasons)})" if reasons else are
 
 
 def _and(parts: Sequence[str]) -> str:

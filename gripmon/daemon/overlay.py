@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import cv2
-import numpy as np
 
+from gripmon.analyse.overlay import Colour, Line, Marks, jpeg
 from gripmon.io.sources.payload import PayloadError, snapshot_image
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, Image, Outlines, Snapshot
-from gripmon.teach.drawing import Canvas, Colour
+from gripmon.record.recorder import to_8_bit
 from gripmon.teach.snapping import outlines_px
 
 _POINTS = 17  # per edge, which the lens bends
@@ -47,22 +47,13 @@ def picture_of(
 def overlay(
     image: Image, record: FrameRecord, outlines: Outlines, width_px: int, reference_px: Outlines | None = None
 ) -> bytes:
-    """JPEG about ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners,
-    yellow if they were used, red if not; ``reference_px``: instead of these, white, where the edges are to be.
+    """JPEG ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners, yellow
+    if they were used, red if not; ``reference_px``: instead of these, white, where the edges are to be.
     """
-    scale = min(1.0, width_px / image.shape[1])
-    smaller = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    canvas = Canvas(np.asarray(smaller), max(1, round(width_px / smaller.shape[1])))
-
-    def placed(points_px: object) -> Array:
-        """Pixel centres are at integers."""
-        return (np.asarray(points_px, dtype=float) + 0.5) * scale - 0.5
-
-    for line_px in outlines:
-        canvas.line(placed(line_px), _OUTLINE.get(record.verdict.value, _LOST), 2)
-    for line_px in reference_px or ():
-        canvas.line(placed(line_px), _REFERENCE, 1)
-    for corner in record.corners if reference_px is None else ():
-        if corner.uv_px is not None:
-            canvas.circle(placed(corner.uv_px), 6.0, _CORNER if corner.used else _REFUSED)
-    return bytes(cv2.imencode(".jpg", canvas.picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+    lines = [Line(line_px, _OUTLINE.get(record.verdict.value, _LOST), 2) for line_px in outlines]
+    lines += [Line(line_px, _REFERENCE) for line_px in reference_px or ()]
+    corners = [c for c in record.corners if c.uv_px is not None] if reference_px is None else []
+    rings = [Marks(corner.uv_px, _CORNER if corner.used else _REFUSED, rings=True) for corner in corners]
+    shown = to_8_bit(image)
+    grey: Image = cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY) if shown.ndim == 3 else shown
+    return jpeg(grey, lines, rings, width_px, _QUALITY)

@@ -5,6 +5,7 @@
     const data = document.getElementById("data-" + place.dataset.figure);
     const figure = JSON.parse(data.textContent);
     figure.layout.template = undefined;
+    if (window.innerWidth < 600) figure.layout.margin = { ...figure.layout.margin, l: 44, r: 6 };
     place.style.height = `${figure.layout.height}px`; // Plotly forgets its own when the window changes
     Plotly.newPlot(place, figure.data, figure.layout, config);
   }
