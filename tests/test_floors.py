@@ -210,7 +210,8 @@ def test_help_imports_nothing_heavy(arguments: list[str]):
             "gripmon.daemon.starting",
             ("rerun", "pyarrow", "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.spatial"),
         ),
-        ("gripmon.record.worker", ("numba", "scipy", "zenoh", "gripmon.track", "gripmon.judge")),
+        ("gripmon.record.written_file", ("numba", "scipy", "zenoh", "gripmon.track", "gripmon.judge")),
+        ("gripmon.record.files", ("rerun", "pyarrow", "scipy", "zenoh")),
     ],
 )
 def test_processes_of_a_monitor_start_without_what_others_need(module: str, needless: tuple[str, ...]):

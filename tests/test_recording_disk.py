@@ -18,7 +18,7 @@ from support.recorded import Recorded, frame, record, recorder, trace, wait_unti
 
 from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Severity
-from gripmon.record.process import SILENT_AFTER_S, Health
+from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
 from gripmon.record.write import ProcessRecorder
 
 LONG_S = 60.0
@@ -126,7 +126,7 @@ def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: P
     assert worker is not None
     os.kill(worker, signal.SIGSTOP)
     wait_until(lambda: writer.failure is not None, LONG_S)
-    assert writer.failure == "recording pauses: its process was stopped from outside"
+    assert writer.failure == SILENT
     os.kill(worker, signal.SIGCONT)
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 10, 10)
@@ -139,7 +139,7 @@ def test_what_a_paused_recording_loses_is_no_thinning() -> None:
     health = Health(0.0)
 
     def look(at_s: float, frames: int, explained: bool) -> str | None:
-        health.look(at_s, at_s, True, os.getpid(), frames, 0, explained)
+        health.look(at_s, at_s, True, frames, 0, explained)
         return health.fault
 
     assert [look(1.1 * i, 10 * i, explained=True) for i in range(1, 9)] == [None] * 8
@@ -147,7 +147,7 @@ def test_what_a_paused_recording_loses_is_no_thinning() -> None:
     assert [look(1.1 * i, 80 + 10 * (i - 14), explained=False) is None for i in range(15, 18)] == [True, True, False]
     assert health.fault is not None and "it can't keep up, frames are dropped" in health.fault
     assert look(20.0, 200, explained=True) is None
-    health.look(20.0 + 2.0 * SILENT_AFTER_S, 20.0, True, os.getpid(), 200, 0, True)
+    health.look(20.0 + 2.0 * SILENT_AFTER_S, 20.0, True, 200, 0, True)
     assert health.fault is not None and health.fault.startswith("recording pauses: its process"), "silence counts"
 
 
@@ -155,7 +155,7 @@ def test_losses_that_go_on_are_said_and_a_burst_is_not() -> None:
     health = Health(0.0)
 
     def look(at_s: float, frames: int, images: int) -> str | None:
-        health.look(at_s, at_s, True, os.getpid(), frames, images)
+        health.look(at_s, at_s, True, frames, images)
         return health.fault
 
     assert [look(t, 5, 0) for t in (1.0, 2.0, 3.0, 4.0, 5.0)] == [None] * 5, "once"
@@ -163,7 +163,7 @@ def test_losses_that_go_on_are_said_and_a_burst_is_not() -> None:
     assert said == [None, None, *["recording thins: it can't keep up, images are dropped"] * 2]
     after = [look(t, 5, 9) for t in (10.0, 11.0, 12.0, 13.0, 14.0, 15.0)]
     assert after[0] is not None and after[-1] is None
-    health.look(20.0 + SILENT_AFTER_S, 19.0, True, os.getpid(), 5, 9)
+    health.look(20.0 + SILENT_AFTER_S, 19.0, True, 5, 9)
     assert health.fault == "recording pauses: its process hasn't answered for 5 s"
     assert look(26.0, 5, 9) is None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import signal
@@ -9,12 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from functools import partial
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import psutil
 import pytest
+from support.loopback import alert_record
 from support.recorded import (
     CAMERA,
     GRIPPER,
@@ -33,14 +36,16 @@ from support.recorded import (
 
 from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.records import ReferenceRecord
-from gripmon.record.columns import Row
+from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
-from gripmon.record.recorder import make_scene
+from gripmon.record.pictures import Row
+from gripmon.record.recorder import Events, make_scene
 from gripmon.record.write import ProcessRecorder
 
 
 @pytest.fixture(autouse=True)
 def no_child_left() -> Iterator[None]:
+    resource_tracker.ensure_running()  # multiprocessing's own, which stays
     before = set(psutil.Process().children())
     yield
     # One that has all it needs may write on for a while.
@@ -156,29 +161,62 @@ def test_signals_for_the_daemon_s_group_don_t_end_the_recording(tmp_path: Path) 
     assert (writer.failure, writer.dropped) == (None, 0)
 
 
-def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(tmp_path: Path) -> None:
-    """A limit on the file's size stands for the disk: the process sees the same failing write."""
+def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever message of a file it is that finds no room: what is there before it can be read."""
+    monkeypatch.setattr("gripmon.record.files._FIRST_RETRY_S", 0.0)
+    room, written = [10**9], os.sendfile
+
+    def sendfile(to: int, source: int, offset: int, count: int) -> int:
+        if room[0] == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sent = written(to, source, offset, min(count, room[0]))
+        room[0] -= sent
+        return sent
+
+    monkeypatch.setattr(os, "sendfile", sendfile)
+    files = FileSeries(make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+
+    def write(first: int) -> None:
+        files.add_frames([Row(record(i), None, None, None) for i in range(first, first + 10)])
+        files.write()
+
+    write(0)
+    room[0] = 5000
+    write(10)
+    assert str(files.failure).startswith(f"recording failed: can't write {tmp_path / 'run-0001.rrd'} (")
+    assert str(files.failure).endswith("MB free): No space left on device")
+    assert (files.frames_written, files.frames_lost, files.path) == (10, 10, None)
+    files.add_events(Events(alerts=[alert_record(text="recording failed: no space")]))
+    write(20)
+    assert (files.frames_lost, sorted(path.name for path in tmp_path.iterdir())) == (20, ["run-0001.rrd"]), "no room"
+    room[0] = 10**9
+    write(30)
+    assert files.failure is None
+    files.close()
+    assert whole_bytes(tmp_path / "run-0001.rrd") == (tmp_path / "run-0001.rrd").stat().st_size
+    told = Recorded(tmp_path / "run-0003.rrd")
+    assert told.seqs() == list(range(30, 40))
+    assert told.blueprint and told.timed("rig/reference")
+    assert any("no space" in str(cell.values["text"]) for cell in told.timed("events")), "why there is a gap"
+
+
+def test_a_process_that_can_t_encode_ends_and_is_replaced(tmp_path: Path) -> None:
+    """A limit on the size of its files holds for memory, too: the thread of rerun that encodes ends."""
     writer = recorder(tmp_path)
     worker = running_worker(writer)
     offer_and_wait(writer, 0, 10)
-    first = writer.path
     limit = 4096 + max(path.stat().st_size for path in tmp_path.glob("*.rrd"))
     resource.prlimit(worker, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
     offer(writer, 10, 60)
     wait_until(lambda: writer.failure is not None)
-    assert "recording failed: can't write" in str(writer.failure)
-    wait_until(lambda: writer.dropped == 60)
-    resource.prlimit(worker, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    wait_until(lambda: writer.failure is None)
-    assert writer.process_id == worker
-    assert writer.path is not None and writer.path != first
+    assert writer.failure == "the recording process ended with code 1"
     offer_and_wait(writer, 70, 10)
-    last = writer.path
+    assert writer.process_id != worker
     writer.close(60.0)
     assert (writer.frames_written, writer.dropped, writer.failure) == (20, 60, None)
-    told = Recorded(last)
-    assert told.seqs() == list(range(70, 80))
-    assert told.blueprint and told.timed("rig/reference")
+    assert Recorded(tmp_path / "run-0002.rrd").seqs() == list(range(70, 80))
 
 
 def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,11 +324,3 @@ def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytes
     writer.close(60.0)
     assert writer.dropped == 35 and "no truth here" in str(writer.failure)
     assert "gripmon-images" not in Path("/proc/self/maps").read_text()
-
-
-def test_the_recording_process_finds_the_package_where_the_daemon_has_it_from() -> None:
-    """A checkout that isn't installed: neither the working directory nor the rooms themselves are searched."""
-    import gripmon
-    from gripmon.record import process
-
-    assert Path(process._HOME) == Path(gripmon.__file__).resolve().parents[1]

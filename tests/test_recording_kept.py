@@ -29,9 +29,9 @@ from support.recorded import (
 )
 
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
-from gripmon.record.columns import Picture, Row
 from gripmon.record.files import FileSeries
-from gripmon.record.keeping import Moments, PictureRing, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
+from gripmon.record.keeping import Moments, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
+from gripmon.record.pictures import Picture, PictureRing, Row
 from gripmon.record.recorder import RecordingSettings, make_scene
 from gripmon.record.write import ProcessRecorder
 
@@ -54,8 +54,7 @@ def run_through(writer: ProcessRecorder, first: int, count: int, alerts: dict[in
 
     def caught_up() -> bool:
         worker = writer._worker
-        assert worker is not None
-        return len(writer._frames) == 0 and worker.images_sent == writer._status.images_done
+        return worker is not None and not writer._waits and worker.images_sent == writer._status.images_done
 
     for i in range(first, first + count):
         writer.frame(frame(i), record(i, alerts=(alerts[i],) if i in alerts else ()), partial(trace, i))
@@ -165,7 +164,9 @@ def test_what_pins() -> None:
 
 def series(directory: Path, name: str = "run", **changes: Any) -> FileSeries:
     chosen = settings(**{"around_alert_s": 0.0, "max_file_bytes": 150_000, **changes})
-    return FileSeries(make_scene(chosen, str(directory), name, "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    made = FileSeries(make_scene(chosen, str(directory), name, "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    made.write()  # begins the first file
+    return made
 
 
 def write(files: FileSeries, first: int, count: int, alarm: int | None = None, size: int = 100_000) -> None:

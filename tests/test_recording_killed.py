@@ -19,10 +19,10 @@ import psutil
 import pytest
 from support.recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
 
-from gripmon.record.columns import Row
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import repair
+from gripmon.record.pictures import Row
 from gripmon.record.read import open_recordings
 from gripmon.record.recorder import make_scene
 
@@ -96,6 +96,7 @@ def test_killed_at_a_random_moment(tmp_path: Path, attempt: int) -> None:
     (run,) = open_recordings([path]).recordings
     ours = run.frames.seq.tolist()
     series = FileSeries(make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    series.write()
     series.close()
     assert rows_of(path) == ours == list(range(len(ours)))
     assert len(ours) >= written > 0

@@ -11,11 +11,26 @@ from pathlib import Path
 import pytest
 import yaml
 from support.gripmon_process import gripmon
-from support.recorded import Recorded, frame, image, record, recorder, trace, wait_until
+from support.recorded import (
+    CAMERA,
+    GRIPPER,
+    REFERENCE,
+    Recorded,
+    frame,
+    image,
+    record,
+    recorder,
+    settings,
+    trace,
+    wait_until,
+)
 
 from gripmon.daemon.config import builtin_config
 from gripmon.model.records import Alert, AlertKind, Cause, Severity
+from gripmon.model.shared_images import SharedImages
+from gripmon.record.process import Worker
 from gripmon.record.read import open_recordings
+from gripmon.record.recorder import Status, make_scene
 from gripmon.record.write import ProcessRecorder
 
 DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
@@ -38,14 +53,14 @@ def pictures(directory: Path) -> set[int]:
 def test_a_source_that_can_wait_loses_no_image(tmp_path: Path) -> None:
     """The monitor outruns an encoder of PNG; with a simulated camera that isn't in real time it waits."""
     demo = builtin_config("demo.yaml")
-    settings = yaml.safe_load(demo.read_text())
-    settings |= {
-        "gripper": str(demo.parent / settings["gripper"]),
+    monitor = yaml.safe_load(demo.read_text())
+    monitor |= {
+        "gripper": str(demo.parent / monitor["gripper"]),
         "source": {"kind": "simulator", "scenario": "bump", "duration_s": 1.5, "fps": 20.0, "realtime": False},
         "publish": {"enabled": False},
         "recording": {"image_format": "png", "image_every": 1, "min_free_bytes": 0},
     }
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(monitor))
     done = gripmon("run", tmp_path / "config.yaml", "--out", tmp_path / "out", timeout_s=400.0)
     assert done.returncode == 0 and "missing" not in done.stderr and "incomplete" not in done.stderr, done.stderr
     (run,) = open_recordings(sorted((tmp_path / "out").glob("*.rrd"))).recordings
@@ -91,23 +106,17 @@ def test_whoever_can_wait_gets_all_images_around_an_alert(tmp_path: Path) -> Non
     assert (writer.dropped, writer.images_dropped, pictures(tmp_path)) == (0, 0, set(range(60)))
 
 
-def test_a_process_that_ends_while_it_is_written_to_still_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_ends_while_it_is_written_to_still_says_why(tmp_path: Path) -> None:
     """The pipe towards it may break before its last report is read."""
-    from gripmon.record import process
-
-    ends = (
-        "import os, sys, msgspec; from gripmon.record.recorder import Status; "
-        "os.write(int(sys.argv[2]), msgspec.json.encode(Status(failure='recording failed: no disk')) + b'\\n')"
-    )
-    writer = recorder(tmp_path)
-    writer.close()
-    monkeypatch.setattr(process, "_BOOTSTRAP", ends)
-    ring = process.ImageRing(64, 48, 1)
-    worker = process.WorkerProcess(writer._scene, ring)
-    assert worker._process.wait(60.0) == 0
+    scene = make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
+    images = SharedImages(1, 64, 48)
+    worker = Worker(scene, images)
+    wait_until(lambda: worker.look() or worker.status.path is not None)
+    path, worker.status = worker.status.path, Status()
+    wait_until(worker._reports.poll)  # one more, which nobody has read
+    worker.kill()
+    worker._process.join(60.0)
     worker.send(b"more")
-    assert worker.gone and worker.status.failure == "recording failed: no disk"
-    worker.discard()
-    ring.close()
+    assert worker.gone and worker.status.path == path, "its reports were read"
+    assert worker.reap() == "the recording process ended with code -9"
+    images.close()

@@ -1,31 +1,21 @@
-"""Parts of the recording by themselves: messages, shared images, pixels, colours, labels."""
+"""Parts of the recording by themselves: shared images, pixels, colours, labels."""
 
 from __future__ import annotations
 
 from collections import Counter
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 from support.recorded import HEIGHT_PX, WIDTH_PX
 
 from gripmon.model.records import State, Verdict
+from gripmon.model.shared_images import SharedImages
 from gripmon.record.columns import Palette
-from gripmon.record.process import ImageRing, Unframer, framed
 from gripmon.record.recorder import to_8_bit
 from gripmon.record.scene import _label_places
 
 
-@given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))
-def test_messages_survive_any_cutting(payloads: list[bytes], cut: int) -> None:
-    stream = b"".join(framed(payload) for payload in payloads)
-    unframer = Unframer()
-    found = [p for i in range(0, len(stream), cut) for p in unframer.feed(stream[i : i + cut])]
-    assert found == payloads
-
-
 def test_shared_images_keep_apart() -> None:
-    ring = ImageRing(WIDTH_PX, HEIGHT_PX, 3)
+    ring = SharedImages(3, WIDTH_PX, HEIGHT_PX)
     rng = np.random.default_rng(5)
     pictures = [
         rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8),

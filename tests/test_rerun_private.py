@@ -26,7 +26,8 @@ def test_a_recorder_that_could_not_free_its_files_does_not_begin(tmp_path: Path,
 
     monkeypatch.delattr(rr.bindings, "flush_and_cleanup_orphaned_recordings")
     scene = make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
+    series = FileSeries(scene)
     with pytest.raises(
         RerunChangedError, match=r"has no rerun\.bindings\.flush_and_cleanup_orphaned_recordings; gripmon"
     ):
-        FileSeries(scene)
+        series.write()

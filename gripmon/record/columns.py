@@ -16,8 +16,6 @@ from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertRecord,
-    FrameRecord,
-    Limits,
     Meta,
     RecordedCommand,
     Severity,
@@ -27,7 +25,8 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.record.recorder import Events, RecordingSettings, Scene, TraceNote
+from gripmon.record.pictures import Row
+from gripmon.record.recorder import Events, RecordingSettings, Scene
 
 APPLICATION_ID = "gripmon"
 _CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame
@@ -74,31 +73,6 @@ class Palette:
 
 def faded(colour: Colour, alpha: int) -> Colour:
     return (*colour[:3], alpha)
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An encoded image with its statistics (grey values 0..255)."""
-
-    blob: bytes
-    media_type: str
-    mean_grey: float
-    contrast_grey: float
-    saturated_percent: float
-    sharpness: float
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A frame; ``limits`` are those in force, None: unknown."""
-
-    record: FrameRecord
-    picture: Picture | None
-    trace: TraceNote | None
-    truth_tcp_m: tuple[float, float, float] | None
-    jaw_reported_m: float | None = None
-    statistic_share: float | None = None
-    limits: Limits | None = None
 
 
 class Sender:

@@ -19,19 +19,18 @@ from gripmon.record.columns import (
     AXIS,
     EventWriter,
     Palette,
-    Picture,
-    Row,
     Sender,
     faded,
     log_view,
     plot,
     two_columns,
 )
+from gripmon.record.curves import CurveWriter
+from gripmon.record.pictures import Picture, Row, measured_picture
 from gripmon.record.read import RecordedFrames
 from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
-from gripmon.record.rows import CurveWriter, RowWriter
+from gripmon.record.rows import RowWriter
 from gripmon.record.scene import rig_view, wrist_image_view
-from gripmon.record.worker import measured_picture
 
 RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32

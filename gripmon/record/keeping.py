@@ -10,7 +10,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -18,9 +18,6 @@ from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity
 from gripmon.record.container import is_complete, whole_bytes
-
-if TYPE_CHECKING:
-    from gripmon.record.columns import Row
 
 PIN_SUFFIX = ".pinned"
 _MOMENTS_KEPT = 64
@@ -68,42 +65,6 @@ class Trigger:
             del self._rank[next(iter(self._rank))]
         self._rank[alert.alert_id] = max(rank, before)
         return rank > before
-
-
-class PictureRing:
-    """Rows with pictures of the last ``span_ns`` of capture time, at most ``limit_bytes``; the oldest are dropped."""
-
-    def __init__(self, span_ns: int, limit_bytes: int) -> None:
-        self._span_ns, self._limit_bytes = span_ns, limit_bytes
-        self._rows: deque[Row] = deque()
-        self.bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def push(self, row: Row) -> None:
-        rows, stamp_ns = self._rows, row.record.stamp_ns
-        if rows and stamp_ns < rows[-1].record.stamp_ns:
-            rows.clear()  # the clock was set back: the age of the others is unknown
-            self.bytes = 0
-        rows.append(row)
-        self.bytes += _size(row)
-        while rows and (self.bytes > self._limit_bytes or stamp_ns - rows[0].record.stamp_ns > self._span_ns):
-            self.bytes -= _size(rows.popleft())
-
-    def take(self, moments: Moments) -> list[Row]:
-        """Remove and return the rows near the moments, in order."""
-        taken: list[Row] = []
-        rest: deque[Row] = deque()
-        for row in self._rows:
-            (taken if moments.near(row.record.stamp_ns) else rest).append(row)
-        self._rows = rest
-        self.bytes -= sum(map(_size, taken))
-        return taken
-
-
-def _size(row: Row) -> int:
-    return 0 if row.picture is None else len(row.picture.blob)
 
 
 class PinnedBy(msgspec.Struct, frozen=True):
@@ -300,6 +261,27 @@ def repair(path: Path) -> int:
         return about.st_size - whole
     finally:
         os.close(lock)
+
+
+def mend(budget: DiskBudget) -> str | None:
+    """Repair earlier files whose writer was killed, and delete pins without a file; advice about what has no footer.
+
+    Errors of the directory are left to whoever begins the first file.
+    """
+    with contextlib.suppress(OSError):
+        paths = [entry.path for entry in budget.recordings()]
+        for path in paths:
+            repair(path)
+        for pin in budget.orphaned_pins():
+            pin.unlink(missing_ok=True)
+        lacking = [path for path in paths if not is_complete(path) and not is_being_written(path)]
+        if lacking:
+            return (
+                f"{len(lacking)} earlier recordings have no footer, as their recorder was killed, the newest "
+                f"{lacking[-1]}; gripmon and rerun's viewer read them; for tools that need one: "
+                "rerun rrd optimize FILE.rrd -o WHOLE.rrd"
+            )
+    return None
 
 
 def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whole: bool = True) -> None:

@@ -1,305 +1,186 @@
-"""The daemon's handle on the recording process: start, pipe, shared images, status reports, health, end."""
+"""The recording process: how the daemon starts it, talks to it and ends it; and what it does.
+
+Nothing here may import rerun or OpenCV, which the daemon's process does without, before :meth:`_Process.run`.
+"""
 
 from __future__ import annotations
 
-import mmap
+import contextlib
+import fcntl
 import os
-import select
-import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from gripmon.model.errors import in_short
+from gripmon.model.priority import give_way
 from gripmon.model.records import Limits
-from gripmon.record.recorder import ImageNote, Scene, Status
+from gripmon.model.shared_images import SharedImages
+from gripmon.record.recorder import Scene, Status
 
-# The working directory must not be searched for modules (-P), but where this package came from must.
-_BOOTSTRAP = (
-    "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
-    "from gripmon.record.worker import main; main(int(sys.argv[2]), int(sys.argv[3]))"
-)
-_HOME = str(Path(__file__).resolve().parents[2])
-_LENGTH_BYTES = 4  # of a message, before it
-_PIPE_WAIT_S = 0.01  # for a batch larger than the pipe's buffer
 _KILL_WAIT_S = 0.5  # a process blocked by the disk dies when the disk answers, perhaps never
-_EXIT_WAIT_S = 0.2  # between a process's last descriptor and its exit code
-_PIXEL_TYPES = frozenset({"|u1", "<u2", "<f4"})
-
-SILENT_AFTER_S = 5.0
-_START_TAKES_S = 30.0  # its imports, on a machine that is busy
-_LOSSES_PERIOD_S = 1.0
-_PERIODS_TO_RAISE = 3  # with losses
-_PERIODS_TO_CLEAR = 5  # without
-_STATE_SAMPLES = 5
-_STOPPED = ("T", "t")  # by SIGSTOP, by a debugger
+_BEAT_WAIT_S = 1.5  # three times the period of its reports
+_LIVE_CLOSE_S = 2.0
+_PIPE_BYTES = 1 << 20  # as much as Linux lets everybody have
 
 
-class ImageRing:
-    """Slots for images in memory that two processes share.
+class Worker:
+    """The daemon's handle on one recording process.
 
-    The memory has no name: it is freed when both processes have ended, however they end.  Pages that were never written
-    cost nothing, so each slot has room for the widest pixels.
+    The process ends by itself when the daemon closes its pipe or ends, and then writes all that it was given.  The
+    thread that starts it must block signals meant for the daemon (Ctrl-C, a service manager's SIGTERM to the group).
     """
 
-    def __init__(self, width_px: int, height_px: int, slots: int, descriptor: int | None = None):
-        """``descriptor``: of the ring that another process made; None: make a new one."""
-        self.slots, self.slot_bytes = slots, width_px * height_px * 3 * 4
-        self.descriptor = os.memfd_create("gripmon-images") if descriptor is None else descriptor
-        if descriptor is None:
-            os.ftruncate(self.descriptor, slots * self.slot_bytes)
-        self._map = mmap.mmap(self.descriptor, slots * self.slot_bytes)
-
-    def put(self, slot: int, image: NDArray[np.generic]) -> ImageNote:
-        """Copy an image into a slot; the interpreter lock is free while the pixels move."""
-        view = np.frombuffer(self._map, image.dtype, image.size, slot * self.slot_bytes).reshape(image.shape)
-        np.copyto(view, image)
-        return ImageNote(slot, image.shape, image.dtype.str)
-
-    def get(self, note: ImageNote) -> NDArray[np.generic]:
-        """A view of the slot, valid until the slot is reused."""
-        count = int(np.prod(note.shape))
-        flat = np.frombuffer(self._map, np.dtype(note.pixel_type), count, note.slot * self.slot_bytes)
-        return flat.reshape(note.shape)
-
-    def takes(self, image: object) -> bool:
-        """Whether this is an image (grey or BGR, 8 or 16 bit or float) that fits into a slot."""
-        if not isinstance(image, np.ndarray) or image.dtype.str not in _PIXEL_TYPES or image.size == 0:
-            return False
-        grey_or_bgr = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-        return grey_or_bgr and image.nbytes <= self.slot_bytes
-
-    def close(self) -> None:
-        self._map.close()
-        os.close(self.descriptor)
-
-
-def framed(payload: bytes) -> bytes:
-    return len(payload).to_bytes(_LENGTH_BYTES, "little") + payload
-
-
-class Unframer:
-    """Splits the bytes from a pipe into whole payloads."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def feed(self, part: bytes) -> Iterator[bytes]:
-        self._buffer += part
-        while len(self._buffer) >= _LENGTH_BYTES:
-            end = _LENGTH_BYTES + int.from_bytes(self._buffer[:_LENGTH_BYTES], "little")
-            if len(self._buffer) < end:
-                return
-            payload = bytes(self._buffer[_LENGTH_BYTES:end])
-            del self._buffer[:end]
-            yield payload
-
-
-class WorkerProcess:
-    """One recording process.  No method blocks, except :meth:`finish` and :meth:`reap`.
-
-    The process ends with its parent, because the pipe that it reads from ends then; signals meant for the daemon
-    (Ctrl-C, a service manager's SIGTERM to the group) don't reach it or are ignored, so that it can finish its file.
-    """
-
-    def __init__(self, scene: Scene, ring: ImageRing):
-        self._reports, status_write = os.pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _BOOTSTRAP, _HOME, str(status_write), str(ring.descriptor)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            pass_fds=(status_write, ring.descriptor),
-            start_new_session=True,
-            # Errors with files are in the status; rerun's own lines on stderr would only repeat them.
-            env={"RUST_LOG": "off", **os.environ, "RERUN": "on"},
-        )
-        os.close(status_write)
-        assert self._process.stdin is not None
-        self._commands: int | None = os.dup(self._process.stdin.fileno())
-        self._process.stdin.close()
-        for descriptor in (self._commands, self._reports):
-            os.set_blocking(descriptor, False)
-        self._unsent = memoryview(framed(msgspec.msgpack.encode(scene)))
-        self._report_part = b""
+    def __init__(self, scene: Scene, images: SharedImages) -> None:
+        """Raises OSError if no process can be started."""
+        theirs, self._batches = get_context("spawn").Pipe(duplex=False)
+        self._reports, told = get_context("spawn").Pipe(duplex=False)
+        with contextlib.suppress(OSError):  # else what is sent while it starts waits in this process
+            fcntl.fcntl(self._batches.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        self._process = _Process(scene, images, theirs, told)
+        try:
+            self._process.start()
+        except OSError:
+            self._batches.close()
+            self._reports.close()
+            raise
+        finally:
+            theirs.close()
+            told.close()
         self._decode = msgspec.json.Decoder(Status).decode
         self.status = Status()
         self.heard = False
         self.heard_s = time.monotonic()
-        self.images_sent = 0
-        self.frames_sent = 0
+        """When its last report was read; before the first one, when it was started."""
+        self.pid = self._process.pid
+        self.sending_from_s: float | None = None
+        """Since when it doesn't take what it is sent, monotonic; None: it does."""
+        self.images_sent = self.frames_sent = 0
         self.limits_sent: Limits | None = None
-        self.gone = False
-        self.still_writes = False
+        self.gone = self.still_writes = False
 
     @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    @property
-    def ready(self) -> bool:
-        """Whether everything passed to :meth:`send` has left this process."""
-        return not self._unsent and not self.gone
+    def frames_unwritten(self) -> int:
+        """Frames that it was sent and has neither written nor given up."""
+        return self.frames_sent - self.status.frames - self.status.frames_lost
 
     def send(self, payload: bytes) -> None:
-        """Send a message; call it only when :attr:`ready`, so that at most one is pending."""
-        self._unsent = memoryview(framed(payload))
-        self.pump()
-        self.pump(_PIPE_WAIT_S)
-
-    def pump(self, wait_s: float = 0.0) -> None:
-        """Write as much as the pipe takes, waiting up to ``wait_s`` for it to take more."""
-        if self._unsent and wait_s > 0.0:
-            _wait_for(self._commands, select.POLLOUT, wait_s)
-        while self._unsent and self._commands is not None and not self.gone:
-            try:
-                self._unsent = self._unsent[os.write(self._commands, self._unsent) :]
-            except BlockingIOError:
-                return
-            except BrokenPipeError:
-                self.read_reports()  # the last status says why it ended
-                self.gone = True
-
-    def read_reports(self) -> None:
-        """Update :attr:`status` to the newest report, and :attr:`gone` when the process has ended."""
-        while not self.gone:
-            try:
-                part = os.read(self._reports, 65536)
-            except BlockingIOError:
-                return
-            if not part:
-                self.gone = True
-            *lines, self._report_part = (self._report_part + part).split(b"\n")
-            if lines:
-                self.heard, self.heard_s = True, time.monotonic()
-                self.status = self._decode(lines[-1])
-
-    def finish(self, deadline: float) -> str | None:
-        """Let it write everything and end.
-
-        A process that has received everything but is still writing at the ``deadline`` (monotonic seconds) is left
-        running, and :attr:`still_writes` is set: it needs no parent and ends on its own.  Any other is killed.  Returns
-        why the recording is incomplete, None if it is complete.
-        """
-        while self._unsent and not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
-            self.pump(left_s)
-        has_everything = not self._unsent
-        self._close_commands()
-        # Read until the pipe ends, so that the process is never blocked by a full pipe.
-        while not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
-            _wait_for(self._reports, select.POLLIN, left_s)
-            self.read_reports()
-        silent_s = time.monotonic() - self.heard_s
-        if not self.gone and has_everything and silent_s < SILENT_AFTER_S and not stands_still(self.pid):
-            self.still_writes = True
-            os.close(self._reports)
-            return None
-        return self.reap(deadline - time.monotonic())
-
-    def discard(self) -> None:
-        """Kill it."""
-        self._process.kill()
-        self.reap(_KILL_WAIT_S)
-
-    def reap(self, timeout_s: float) -> str | None:
-        """Wait for the end of the process or kill it, then close all descriptors."""
-        self._close_commands()
+        """Send a message.  Blocks while the process doesn't run, until it does or is killed."""
+        self.sending_from_s = time.monotonic()
         try:
-            code = self._process.wait(max(timeout_s, _EXIT_WAIT_S))
-            failure = None if code == 0 else f"the recording process ended with code {code}"
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            failure = "the recording process did not finish in time; the end of its last file may be missing"
-            try:
-                self._process.wait(_KILL_WAIT_S)
-            except subprocess.TimeoutExpired:
-                failure = "the recording process hangs in a disk that doesn't answer, and was left there"
-        os.close(self._reports)
-        return failure
+            self._batches.send_bytes(payload)
+        except OSError:
+            self.look()  # its last report says why it ended
+            self.gone = True
+        self.sending_from_s = None
 
-    def _close_commands(self) -> None:
-        if self._commands is not None:
-            os.close(self._commands)
-            self._commands = None
+    def look(self) -> None:
+        """Update :attr:`status` to the newest report, and :attr:`gone` when the process has ended."""
+        newest = None
+        try:
+            while not self.gone and self._reports.poll():
+                newest = self._reports.recv_bytes()
+        except (EOFError, OSError):
+            self.gone = True
+        if newest is not None:
+            self.status, self.heard, self.heard_s = self._decode(newest), True, time.monotonic()
 
+    def finish(self, deadline: float, *, complete: bool) -> str | None:
+        """Let it write everything and end; ``complete``: it was sent everything.
 
-def _wait_for(descriptor: int | None, event: int, timeout_s: float) -> None:
-    if descriptor is not None:
-        poll = select.poll()
-        poll.register(descriptor, event)
-        poll.poll(1e3 * timeout_s)
-
-
-class Health:
-    """Whether the process responds and keeps up, judged by counts and times alone; ``fault`` is one line, None while
-    all is well.
-    """
-
-    def __init__(self, now_s: float) -> None:
-        self.fault: str | None = None
-        self._looked_s = now_s
-        self._counts = (0, 0)
-        self._with_losses = self._without = 0
-        self._thins: str | None = None
-
-    def look(
-        self, now_s: float, heard_s: float, heard: bool, pid: int, frames: int, images: int, explained: bool = False
-    ) -> None:
-        """``heard_s``: time of its last report, or of its start if it was never ``heard``; ``frames`` and ``images``
-        count what was dropped so far.  ``explained``: the process itself says why it writes nothing, so that losses
-        don't mean that it is too slow.
+        A complete process that is still writing at the ``deadline`` (monotonic seconds) is left running, and
+        :attr:`still_writes` is set: it needs no parent and ends on its own.  Any other is killed.  Returns why the
+        recording is incomplete, None if it is complete.
         """
-        if now_s - heard_s > (SILENT_AFTER_S if heard else _START_TAKES_S):
-            self.fault = f"recording pauses: {_why_silent(pid)}"
-            self._counts, self._looked_s = (frames, images), now_s
-            return
-        if now_s - self._looked_s >= _LOSSES_PERIOD_S:
-            self._looked_s = now_s
-            self._count(heard and not explained, frames, images)
-        if explained:
-            self._thins, self._with_losses = None, 0
-        self.fault = self._thins
+        self._batches.close()
+        while not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
+            self._reports.poll(left_s)
+            self.look()
+        if not self.gone and complete and not self.status.hangs:
+            self.still_writes = self._reports.poll(_BEAT_WAIT_S)
+            self.look()
+            self.still_writes &= not self.gone
+        return None if self.still_writes else self.reap()
 
-    def _count(self, counts: bool, frames: int, images: int) -> None:
-        """A short burst of losses is not reported, losses that last for seconds are."""
-        (frames_before, images_before), self._counts = self._counts, (frames, images)
-        what = "frames" if frames > frames_before else "images" if images > images_before else ""
-        losing = bool(what) and counts
-        self._with_losses = self._with_losses + 1 if losing else 0
-        self._without = 0 if losing else self._without + 1
-        if self._with_losses >= _PERIODS_TO_RAISE and self._thins is None:
-            self._thins = f"recording thins: it can't keep up, {what} are dropped"
-        elif self._without >= _PERIODS_TO_CLEAR:
-            self._thins = None
+    def reap(self) -> str | None:
+        """Wait for the end of a process that is :attr:`gone`, kill any other, and close everything."""
+        failure = None
+        if self.gone:
+            self._process.join(_KILL_WAIT_S)
+        if self._process.is_alive():
+            self.kill()
+            self._process.join(_KILL_WAIT_S)
+            failure = "the recording process did not finish in time; the end of its last file may be missing"
+        for pipe in (self._batches, self._reports):
+            pipe.close()
+        if self._process.is_alive():
+            return "the recording process hangs in a disk that doesn't answer, and was left there"
+        code = self._process.exitcode
+        self._process.close()
+        return failure or (None if code == 0 else f"the recording process ended with code {code}")
 
-
-def stands_still(pid: int) -> bool:
-    """Whether a process was stopped from outside, or one of its threads waits for a disk in every sample over a tenth
-    of a second.
-    """
-    for _ in range(_STATE_SAMPLES):
-        states = [_state(thread) for thread in Path(f"/proc/{pid}/task").glob("*")]
-        if not any(state in ("D", *_STOPPED) for state in states):
-            return False
-        time.sleep(0.1 / _STATE_SAMPLES)
-    return True
+    def kill(self) -> None:
+        """Kill it, from any thread: a blocked :meth:`send` then returns."""
+        with contextlib.suppress(ValueError):  # it is closed already
+            self._process.kill()
 
 
-def _state(process: Path) -> str:
-    """The state letter that Linux gives a process or thread; empty if it doesn't exist."""
+class _Process(SpawnProcess):
+    def __init__(self, scene: Scene, images: SharedImages, batches: Connection, reports: Connection) -> None:
+        super().__init__(name="gripmon-recording", daemon=False)
+        self._given = scene, images, batches, reports
+
+    def join(self, timeout: float | None = 0.0) -> None:
+        """At the end of the interpreter, multiprocessing joins every process; this one must not be waited for."""
+        super().join(timeout)
+
+    def run(self) -> None:
+        os.setsid()  # what a terminal does to the daemon isn't meant for this process
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # whoever reads the daemon's output waits for its end
+        # Errors with files are in the status; rerun's own lines on stderr would only repeat them.
+        os.environ |= {"RUST_LOG": os.environ.get("RUST_LOG", "off"), "RERUN": "on"}
+        give_way()
+        _or_end(_record, *self._given)
+        os._exit(0)  # everything is written; a viewer that stalls may still hold the live view's thread
+
+
+def _or_end(work: Callable[..., None], *given: Any) -> None:
+    """Work, in any thread; what that raises ends the process: the daemon starts another one."""
     try:
-        return (process / "stat").read_text().rpartition(")")[2].split()[0]
-    except (OSError, IndexError):
-        return ""
+        work(*given)
+    except Exception as error:  # noqa: BLE001 - reported in one line
+        sys.stderr.write(f"recording process: {in_short(error)}\n")
+        sys.stderr.flush()
+        os._exit(1)
 
 
-def _why_silent(pid: int) -> str:
-    state = _state(Path(f"/proc/{pid}"))
-    if state == "D":
-        return "the disk doesn't answer"
-    if state in _STOPPED:
-        return "its process was stopped from outside"
-    return f"its process hasn't answered for {SILENT_AFTER_S:g} s"
+def _record(scene: Scene, images: SharedImages, batches: Connection, reports: Connection) -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+    from gripmon.record.files import FileSeries
+    from gripmon.record.taking import FileInbox, Taker
+
+    files = FileSeries(scene) if scene.settings.enabled else FileInbox(scene.directory)
+    live = None
+    if scene.view is not None:
+        from gripmon.record.live import LiveStream
+
+        live = LiveStream(scene, scene.view)
+    taker = Taker(scene.settings, images, batches, reports, files, live)
+    threading.Thread(target=_or_end, args=(taker.run,), name="taking", daemon=True).start()
+    period_s = scene.settings.flush_period_s
+    if live is not None:
+        serving = threading.Thread(target=_or_end, args=(live.serve, period_s), name="live view", daemon=True)
+        serving.start()
+    files.serve(period_s, taker.report)
+    if live is not None:
+        serving.join(_LIVE_CLOSE_S)
+    taker.report()

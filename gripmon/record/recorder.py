@@ -29,6 +29,7 @@ from gripmon.model.records import (
     ReferenceRecord,
     StateRecord,
 )
+from gripmon.model.shared_images import ImagePlace
 
 LOOPBACK = "127.0.0.1"
 
@@ -207,14 +208,6 @@ def make_scene(
     )  # fmt: skip
 
 
-class ImageNote(msgspec.Struct, frozen=True, array_like=True):
-    """An image in the shared memory."""
-
-    slot: int
-    shape: tuple[int, ...]
-    pixel_type: str
-
-
 class TraceNote(msgspec.Struct, frozen=True, array_like=True):
     """A :class:`MeasurementTrace` in bytes: positions as float32 pairs, distances as float32, flags as uint8."""
 
@@ -232,7 +225,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     """
 
     record: FrameRecord
-    image: ImageNote | None
+    image: ImagePlace | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
     jaw_reported_m: float | None
@@ -297,6 +290,7 @@ class Status(msgspec.Struct, frozen=True):
     view_failure: str | None = None  # of the live view; the recording itself is not affected
     notice: str | None = None  # advice about earlier files
     images_lost: int = 0  # around alerts, or because of a failed disk; the sender counts dropped images that were due
+    hangs: bool = False  # the disk doesn't answer
 
 
 def pack_trace(trace: MeasurementTrace) -> TraceNote:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -17,7 +16,6 @@ from gripmon.record.columns import (
     APPLICATION_ID,
     AXIS,
     Palette,
-    Row,
     Sender,
     image_view,
     log_view,
@@ -26,6 +24,7 @@ from gripmon.record.columns import (
     pose_columns,
     two_columns,
 )
+from gripmon.record.pictures import Row
 from gripmon.record.recorder import Scene, TraceNote, pairs
 
 IMAGE = "rig/camera/image"
@@ -47,11 +46,17 @@ _NO_POINTS = np.empty((0, 3))
 _BOUNDS = [f"protection/{name}_mm" for name in ("level", "since_reference", "absolute", "limit")]
 
 
-class _Corner(NamedTuple):
-    uv_px: tuple[float, float]
-    label_px: tuple[float, float]
-    label: str
-    used: bool
+_LAYERS = {
+    "edges/used": (Palette.EDGE_USED, _POINT_PX),
+    "edges/refused": (Palette.EDGE_REFUSED, _POINT_PX),
+    "corners/predicted": (Palette.PREDICTED, _CORNER_PX),
+    "corners/used": (Palette.CORNER_USED, _CORNER_PX),
+    "corners/refused": (Palette.CORNER_REFUSED, _CORNER_PX),
+    "labels/used": (Palette.CORNER_USED, 0.0),
+    "labels/refused": (Palette.CORNER_REFUSED, 0.0),
+}
+"""Points of the overlay: colour, radius."""
+_Points = dict[str, tuple[_Pixels, list[str] | None]]
 
 
 class OverlayWriter:
@@ -60,74 +65,50 @@ class OverlayWriter:
     def __init__(self, send: Sender, corner_ids: tuple[str, ...], height_px: int):
         self._send, self._corner_ids = send, corner_ids
         self._label_px = _LABEL_HEIGHT_FRACTION * height_px
-        static = send.static
-        static(f"{IMAGE}/edges/predicted", rr.LineStrips2D.from_fields(colors=Palette.PREDICTED, radii=_LINE_PX))
-        for name, colour, radius_px in (
-            ("edges/used", Palette.EDGE_USED, _POINT_PX),
-            ("edges/refused", Palette.EDGE_REFUSED, _POINT_PX),
-            ("corners/predicted", Palette.PREDICTED, _CORNER_PX),
-            ("corners/used", Palette.CORNER_USED, _CORNER_PX),
-            ("corners/refused", Palette.CORNER_REFUSED, _CORNER_PX),
-            ("labels/used", Palette.CORNER_USED, 0.0),
-            ("labels/refused", Palette.CORNER_REFUSED, 0.0),
-        ):
-            static(f"{IMAGE}/{name}", rr.Points2D.from_fields(colors=colour, radii=radius_px))
+        send.static(f"{IMAGE}/edges/predicted", rr.LineStrips2D.from_fields(colors=Palette.PREDICTED, radii=_LINE_PX))
+        for name, (colour, radius_px) in _LAYERS.items():
+            send.static(f"{IMAGE}/{name}", rr.Points2D.from_fields(colors=colour, radii=radius_px))
 
     def write(self, rows: Sequence[Row]) -> None:
-        # A refused frame has no picture, but must remove the overlay of the frame before.
-        rows = [row for row in rows if row.picture is not None or not row.record.measured]
-        if not rows:
-            return
+        """A refused frame has no picture, but must remove the overlay of the frame before."""
         self._send.images(IMAGE, [row for row in rows if row.picture is not None])
-        self._draw(rows)
+        self._draw([row for row in rows if row.picture is not None or not row.record.measured])
 
     def write_late(self, rows: Sequence[Row]) -> None:
         """Images of frames that were written earlier without them; overlays of refused frames are written already."""
         self._send.images(IMAGE, rows)
-        rows = [row for row in rows if row.record.measured]
-        if rows:
-            self._draw(rows)
+        self._draw([row for row in rows if row.record.measured])
 
     def _draw(self, rows: Sequence[Row]) -> None:
-        traces = [row.trace or _NOT_TRACED for row in rows]
-        self._edges(rows, traces)
-        self._points("edges/used", rows, [_edge_points(trace, used=True) for trace in traces])
-        self._points("edges/refused", rows, [_edge_points(trace, used=False) for trace in traces])
-        self._points("corners/predicted", rows, [_predicted_corners(trace) for trace in traces])
-        corners = [self._corners(row.record, trace) for row, trace in zip(rows, traces, strict=True)]
-        for kind, used in (("used", True), ("refused", False)):
-            shown = [[corner for corner in some if corner.used == used] for some in corners]
-            self._points(f"corners/{kind}", rows, [_pixels([c.uv_px for c in some]) for some in shown])
-            places = [_pixels([c.label_px for c in some]) for some in shown]
-            self._points(f"labels/{kind}", rows, places, [[c.label for c in some] for some in shown])
+        if not rows:
+            return
+        edges = [_predicted_edges(row.trace or _NOT_TRACED) for row in rows]
+        columns = rr.LineStrips2D.columns(strips=[strip for some in edges for strip in some])
+        self._send.frames(f"{IMAGE}/edges/predicted", rows, columns.partition([len(some) for some in edges]))
+        drawn = [self._points(row.record, row.trace or _NOT_TRACED) for row in rows]
+        for name in _LAYERS:
+            points = [each[name][0] for each in drawn]
+            labels = [label for each in drawn for label in each[name][1] or ()]
+            named = labels if drawn[0][name][1] is not None else None
+            columns = rr.Points2D.columns(positions=np.concatenate(points), labels=named)
+            self._send.frames(f"{IMAGE}/{name}", rows, columns.partition([len(each) for each in points]))
 
-    def _edges(self, rows: Sequence[Row], traces: Sequence[TraceNote]) -> None:
-        edges = [_predicted_edges(trace) for trace in traces]
-        strips = [strip for some in edges for strip in some]
-        columns = rr.LineStrips2D.columns(strips=strips).partition([len(some) for some in edges])
-        self._send.frames(f"{IMAGE}/edges/predicted", rows, columns)
-
-    def _points(
-        self, name: str, rows: Sequence[Row], points: Sequence[_Pixels], labels: Sequence[list[str]] | None = None
-    ) -> None:
-        positions = np.concatenate(points)
-        flat = None if labels is None else [label for some in labels for label in some]
-        columns = rr.Points2D.columns(positions=positions, labels=flat).partition([len(p) for p in points])
-        self._send.frames(f"{IMAGE}/{name}", rows, columns)
-
-    def _corners(self, record: FrameRecord, trace: TraceNote) -> list[_Corner]:
-        """Corners with labels; a corner that was not measured is shown at its prediction, with the reason."""
+    def _points(self, record: FrameRecord, trace: TraceNote) -> _Points:
+        """A frame's, by layer; a corner that was not measured is shown at its prediction, with the reason."""
         predicted = pairs(trace.predicted_corners_uv_px)
         where = {name: (float(u), float(v)) for name, (u, v) in zip(self._corner_ids, predicted, strict=False)}
         found = [(corner, corner.uv_px or where.get(corner.id)) for corner in record.corners]
         known = [(corner, uv_px) for corner, uv_px in found if uv_px is not None and np.isfinite(uv_px).all()]
         labels_px = _label_places([uv_px for _, uv_px in known], self._label_px)
-        return [
-            _Corner(
-                uv_px, label_px, corner.id if corner.reason is None else f"{corner.id}: {corner.reason}", corner.used
-            )
-            for (corner, uv_px), label_px in zip(known, labels_px, strict=True)
-        ]
+        points: _Points = {"corners/predicted": (_finite(predicted), None)}
+        uv_px, fitted = pairs(trace.edge_uv_px), np.frombuffer(trace.edge_used, np.uint8)
+        for kind, used in (("used", True), ("refused", False)):
+            shown = [i for i, (corner, _) in enumerate(known) if corner.used == used]
+            texts = [f"{known[i][0].id}: {known[i][0].reason}" if known[i][0].reason else known[i][0].id for i in shown]
+            points[f"edges/{kind}"] = uv_px[fitted == used], None
+            points[f"corners/{kind}"] = _pixels([known[i][1] for i in shown]), None
+            points[f"labels/{kind}"] = _pixels([labels_px[i] for i in shown]), texts
+        return points
 
 
 def _label_places(corners_px: Sequence[tuple[float, float]], step_px: float) -> list[tuple[float, float]]:
@@ -149,19 +130,13 @@ def _pixels(points: Sequence[tuple[float, float]]) -> _Pixels:
     return np.array(points, np.float32).reshape(-1, 2)
 
 
-def _edge_points(trace: TraceNote, used: bool) -> _Pixels:
-    return pairs(trace.edge_uv_px)[np.frombuffer(trace.edge_used, np.uint8) == used]
-
-
 def _predicted_edges(trace: TraceNote) -> list[_Pixels]:
-    splits = np.cumsum(trace.predicted_edge_lengths)[:-1]
-    strips = np.split(pairs(trace.predicted_edges_uv_px), splits)
-    return [strip for strip in (s[np.isfinite(s).all(axis=1)] for s in strips) if len(strip) > 1]
+    strips = np.split(pairs(trace.predicted_edges_uv_px), np.cumsum(trace.predicted_edge_lengths)[:-1])
+    return [strip for strip in map(_finite, strips) if len(strip) > 1]
 
 
-def _predicted_corners(trace: TraceNote) -> _Pixels:
-    corners = pairs(trace.predicted_corners_uv_px)
-    return corners[np.isfinite(corners).all(axis=1)]
+def _finite(points: _Pixels) -> _Pixels:
+    return points[np.isfinite(points).all(axis=1)]
 
 
 class RigWriter:
@@ -206,12 +181,10 @@ class RigWriter:
 
     def _looks_different(self, row: Row) -> bool:
         """Whether the jaws moved or the verdict changed since the fingers were last drawn."""
-        opening_m, verdict = self._look(row.record)
-        if self._drawn is not None:
-            same_opening = abs(opening_m - self._drawn[0]) < _JAW_STEP_M
-            if same_opening and verdict == self._drawn[1]:
-                return False
-        self._drawn = (opening_m, verdict)
+        look = self._look(row.record)
+        if self._drawn is not None and look[1] == self._drawn[1] and abs(look[0] - self._drawn[0]) < _JAW_STEP_M:
+            return False
+        self._drawn = look
         return True
 
     def _look(self, record: FrameRecord) -> tuple[float, Verdict]:
@@ -250,11 +223,9 @@ class RigWriter:
         arrows = [_arrow(row.record) for row in rows]
         known = [arrow for arrow in arrows if arrow is not None]
         columns = rr.Arrows3D.columns(
-            origins=[origin for origin, _ in known],
-            vectors=[vector for _, vector in known],
-            colors=[Palette.SHIFT] * len(known),
-            radii=[_LINE_M] * len(known),
-        )
+            origins=[origin for origin, _ in known], vectors=[vector for _, vector in known],
+            colors=[Palette.SHIFT] * len(known), radii=[_LINE_M] * len(known),
+        )  # fmt: skip
         self._send.frames("rig/tcp_shift", rows, columns.partition([int(arrow is not None) for arrow in arrows]))
 
     def _outlines(self, points_m: Array) -> list[Array]:
@@ -344,13 +315,9 @@ def rig_view(scene: Scene) -> rrb.Spatial3DView:
         position=target_m + distance_m * np.array(_EYE), look_target=target_m, eye_up=(0.0, -1.0, 0.0)
     )
     return rrb.Spatial3DView(
-        origin="rig",
-        contents=["rig/**"],
-        name="Camera and gripper; white: gripper at the reference",
-        eye_controls=eye,
-        line_grid=False,
-        background=Palette.BACKGROUND,
-    )
+        origin="rig", contents=["rig/**"], name="Camera and gripper; white: gripper at the reference",
+        eye_controls=eye, line_grid=False, background=Palette.BACKGROUND,
+    )  # fmt: skip
 
 
 def _details(scene: Scene) -> rrb.Tabs:
@@ -358,11 +325,7 @@ def _details(scene: Scene) -> rrb.Tabs:
     close_up = ["drift/noticed_mm", "drift/tcp_shift_sigma_mm", "drift/tcp_shift_mm"]
     return rrb.Tabs(
         plot("drift", close_up, "Close up (mm)", legend=False, shown=_CLOSE_UP_MM),
-        plot(
-            "protection",
-            _BOUNDS,
-            "Protection (mm)",
-        ),
+        plot("protection", _BOUNDS, "Protection (mm)"),
         *error,
         plot("residual", "residual/rms_px", "Residual (px)"),
         plot("residual", "residual/corners_px", "Corners (px)"),

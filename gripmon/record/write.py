@@ -5,10 +5,12 @@ from __future__ import annotations
 import datetime
 import logging
 import math
+import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,11 +31,12 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.record.process import Health, ImageRing, WorkerProcess
+from gripmon.model.shared_images import ImagePlace, SharedImages
+from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
+from gripmon.record.process import Worker
 from gripmon.record.recorder import (
     Events,
     FrameNote,
-    ImageNote,
     Recorder,
     RecordingSettings,
     Scene,
@@ -53,23 +56,23 @@ ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
 _LOSSES_PERIOD_S = 60.0  # between two log lines about losses
 _EVENTS_KEPT = 4096  # while there is no process
+_FOR_THE_DAEMON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 Truth = Callable[[int], tuple[float, float, float] | None]
 
 
 class _Waiting(NamedTuple):
-    """A frame in the queue.  ``counted``: its image is among those queued; ``due``: its image is always written, not
-    only around an alert; ``lost``: there was no room for its image.
+    """A frame in the queue.  ``image``: None if it isn't kept; ``due``: it is always written, not only around an alert;
+    ``lost``: there was no room for it.
     """
 
     record: FrameRecord
-    counted: bool
     image: Image | None
     trace: MeasurementTrace | None
     jaw_reported_m: float | None
     notes: MonitorNotes | None
     due: bool
-    lost: bool = False
+    lost: bool
 
 
 class ProcessRecorder(Recorder):
@@ -77,7 +80,7 @@ class ProcessRecorder(Recorder):
 
     ``frame`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
     afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread copies images into shared memory and
-    writes everything else, in batches, to a pipe.  If the recording process can't keep up, first images and then frames
+    sends everything else, in batches.  If the recording process can't keep up, first images and then the oldest frames
     are dropped and counted.  If it dies, it is started again and begins a new file.
     """
 
@@ -89,8 +92,8 @@ class ProcessRecorder(Recorder):
         self._images_before = max(1, settings.queue_images - settings.queue_images // 4)
         self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
         # Written by the loop's thread only.
-        self._queued = self._not_queued = 0
-        self._images_offered = self._images_not_queued = 0
+        self._offered = self._overflowed = 0
+        self._images_queued = self._images_not_queued = 0
         self._image_stamp_ns: int | None = None
         self._shown: tuple[State, Verdict, str, int] | None = None
         self._newest_record: FrameRecord | None = None
@@ -98,9 +101,10 @@ class ProcessRecorder(Recorder):
         self._frames: deque[_Waiting] = deque()
         self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
+        self._held: _Waiting | None = None  # taken from the queue; waits for a slot for its image
+        self._held_from_s = math.inf
         self._images_taken = self._images_without_slot = self._images_lost_earlier = 0
         self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
-        self._slot_waited_from: float | None = None
         self._lost_earlier = self._written_earlier = 0
         self._left_writing = 0  # frames that the process is still writing when this object is closed
         self._newest_reference = scene.reference
@@ -109,8 +113,8 @@ class ProcessRecorder(Recorder):
         self._health = Health(time.monotonic())
         self._restart_pause_s, self._restart_at = 1.0, 0.0
         self._encode = msgspec.msgpack.Encoder().encode
-        self._ring = ImageRing(scene.lens.width_px, scene.lens.height_px, settings.queue_images)
-        self._worker: WorkerProcess | None = WorkerProcess(scene, self._ring)
+        self._images = SharedImages(settings.queue_images, scene.lens.width_px, scene.lens.height_px)
+        self._worker: Worker | None = None
         self._status = Status()
         self._closing = threading.Event()
         self._close_before = 0.0
@@ -120,7 +124,7 @@ class ProcessRecorder(Recorder):
     @property
     def dropped(self) -> int:
         """Frames missing from the recording: the queue was full, the process died, or nothing could be written."""
-        return self._not_queued + self._lost_earlier + self._status.frames_lost
+        return self._overflowed + self._lost_earlier + self._status.frames_lost
 
     @property
     def images_dropped(self) -> int:
@@ -132,7 +136,7 @@ class ProcessRecorder(Recorder):
     def has_room(self) -> bool:
         """Whether the next frame and its image would be accepted; also true while recording fails."""
         images = self._images_before if self._keeps_before else self._settings.queue_images
-        waiting = self._images_offered - self._images_taken
+        waiting = self._images_queued - self._images_taken
         return self.failure is not None or (len(self._frames) < self._settings.queue_frames and waiting < images)
 
     @property
@@ -142,6 +146,10 @@ class ProcessRecorder(Recorder):
 
     @property
     def failure(self) -> str | None:
+        worker = self._worker
+        sending_from_s = None if worker is None else worker.sending_from_s
+        if sending_from_s is not None and time.monotonic() - sending_from_s > SILENT_AFTER_S:
+            return SILENT
         return self._own_failure or self._health.fault or self._status.failure
 
     @property
@@ -160,28 +168,23 @@ class ProcessRecorder(Recorder):
         if self._patience_s > 0.0:
             self._wait_for_room()
         if len(self._frames) >= self._settings.queue_frames:
-            self._not_queued += 1
-            return
+            self._drop_oldest()
         shown = (record.state, record.verdict, record.reference_id, record.revision)
-        self._queued += 1
+        self._offered += 1
         due = bool(self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown)
         self._shown = shown
-        noted = None if notes is None else notes()
-        waiting = self._images_offered - self._images_taken
-        if due and waiting < self._settings.queue_images:
-            self._images_offered += 1
-            self._image_stamp_ns = record.stamp_ns
-            item = _Waiting(record, True, frame.image, trace(), frame.jaw_opening_m, noted, due)
-        elif self._keeps_before and not due and waiting < self._images_before:
-            # Kept in case of an alert.  Its trace would cost the loop more than everything else here.
-            self._images_offered += 1
-            item = _Waiting(record, True, frame.image, None, frame.jaw_opening_m, noted, due)
-        else:
-            has_image = frame.image is not None
-            self._images_not_queued += due and has_image
-            lost = has_image and (due or self._keeps_before)
-            item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, due, lost)
-        self._frames.append(item)
+        # An image that isn't due is kept in case of an alert; its trace would cost the loop more than all else here.
+        wanted = due or self._keeps_before
+        room = self._settings.queue_images if due else self._images_before
+        kept = wanted and self._images_queued - self._images_taken < room
+        lost = wanted and not kept and frame.image is not None
+        if kept:
+            self._images_queued += 1
+            self._image_stamp_ns = record.stamp_ns if due else self._image_stamp_ns
+        self._images_not_queued += due and lost
+        measured, noted = trace() if kept and due else None, None if notes is None else notes()
+        image = frame.image if kept else None
+        self._frames.append(_Waiting(record, image, measured, frame.jaw_opening_m, noted, due, lost))
 
     def event(self, event: Event) -> None:
         """Record what is neither in the scene nor in a frame's record."""
@@ -202,9 +205,13 @@ class ProcessRecorder(Recorder):
             return
         self._close_before = time.monotonic() + timeout_s
         self._closing.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive() and (worker := self._worker) is not None and worker.sending_from_s is not None:
+            worker.kill()  # it doesn't take what it is sent
         self._thread.join()
         self._frames.clear()
-        self._lost_earlier = self._queued - self.frames_written - self._left_writing - self._status.frames_lost
+        self._lost_earlier = self._offered - self._overflowed - self.frames_written - self._left_writing
+        self._lost_earlier -= self._status.frames_lost
         self._log_losses()
 
     def _wait_for_room(self) -> None:
@@ -212,9 +219,18 @@ class ProcessRecorder(Recorder):
         while not self.has_room and time.monotonic() < end:
             time.sleep(ROOM_POLL_S)
 
+    def _drop_oldest(self) -> None:
+        try:
+            oldest = self._frames.popleft()
+        except IndexError:  # the hand-over thread took the last one meanwhile
+            return
+        self._overflowed += 1
+        self._images_queued -= oldest.image is not None
+        self._images_not_queued -= oldest.due and oldest.lost  # they count images of other frames
+
     def _image_is_due(self, stamp_ns: int) -> bool:
         every = self._settings.image_every
-        if every > 0 and (self._queued - 1) % every == 0:
+        if every > 0 and (self._offered - 1) % every == 0:
             return True
         if self._image_interval_ns is None:
             return False
@@ -222,11 +238,17 @@ class ProcessRecorder(Recorder):
         return self._image_stamp_ns is None or not 0 <= stamp_ns - self._image_stamp_ns < self._image_interval_ns
 
     def _run(self) -> None:
+        # Processes inherit the mask of the thread that starts them; multiprocessing's own helper would undo it.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_DAEMON)
+        period_s = HANDOVER_PERIOD_S if self._patience_s == 0.0 else ROOM_POLL_S
         try:
-            while not self._closing.wait(HANDOVER_PERIOD_S if self._patience_s == 0.0 else ROOM_POLL_S):
+            while True:
                 self._hand_over()
+                if self._closing.wait(period_s):
+                    break
             self._hand_over()
-            while self._frames and self._worker is not None and time.monotonic() < self._close_before:
+            while self._waits and self._worker is not None and time.monotonic() < self._close_before:
                 time.sleep(ROOM_POLL_S)
                 self._hand_over()
         except Exception as error:  # noqa: BLE001 - a failing recording must not end the monitor
@@ -235,31 +257,36 @@ class ProcessRecorder(Recorder):
             self._close_before = time.monotonic() + _STOPPED_TIMEOUT_S
         self._finish()
 
+    @property
+    def _waits(self) -> bool:
+        return bool(self._frames) or self._held is not None
+
     def _hand_over(self) -> None:
         worker = self._running_worker()
         if worker is None:
             return
-        worker.pump()
-        worker.read_reports()
-        if worker.status.view_failure is not None and worker.status.view_failure != self._status.view_failure:
-            _log.warning("%s; the monitor and its recording go on", worker.status.view_failure)
-        if worker.status.notice is not None and self._status.notice is None:
-            _log.info("%s", worker.status.notice)
-        self._status = worker.status
-        while worker.ready:
+        self._take_reports(worker)
+        while not worker.gone:
             frames, events = self._next_frames(worker), self._next_events()
             if not (frames or events):
                 break
             worker.send(self._encode((frames, events)))  # a Batch
         if worker.gone:
-            ended = worker.reap(0.0) or "the recording process ended by itself"
-            self._count_dead(worker, (worker.status.failure or ended).removeprefix("recording failed: "))
+            self._count_dead(worker)
             return
         now_s, explained = time.monotonic(), worker.status.failure is not None
         losses = self.dropped, self.images_dropped
-        self._health.look(now_s, worker.heard_s, worker.heard, worker.pid, *losses, explained)
+        self._health.look(now_s, worker.heard_s, worker.heard, *losses, explained)
         if now_s - self._losses_logged_s >= _LOSSES_PERIOD_S:
             self._log_losses(now_s)
+
+    def _take_reports(self, worker: Worker) -> None:
+        worker.look()
+        before, self._status = self._status, worker.status
+        if self._status.view_failure not in (None, before.view_failure):
+            _log.warning("%s; the monitor and its recording go on", self._status.view_failure)
+        if self._status.notice is not None and before.notice is None:
+            _log.info("%s", self._status.notice)
 
     def _log_losses(self, now_s: float = math.inf) -> None:
         """Log one line if losses have grown since the last one."""
@@ -268,25 +295,32 @@ class ProcessRecorder(Recorder):
             self._losses_logged, self._losses_logged_s = losses, now_s
             _log.warning("missing in the recording so far: frames: %d; images of other frames: %d", *losses)
 
-    def _running_worker(self) -> WorkerProcess | None:
+    def _running_worker(self) -> Worker | None:
         if self._worker is None and time.monotonic() >= self._restart_at:
-            scene = msgspec.structs.replace(self._scene, reference=self._newest_reference)
-            self._worker = WorkerProcess(scene, self._ring)
+            try:
+                scene = msgspec.structs.replace(self._scene, reference=self._newest_reference)
+                self._worker = Worker(scene, self._images)
+            except OSError as error:
+                self._pause(f"no process can be started ({error})")
         elif self._worker is not None and self._own_failure is not None and self._worker.status.frames > 0:
             self._own_failure = None
             self._restart_pause_s = 1.0
             _log.warning("recording goes on: %s", self._worker.status.path)
         return self._worker
 
-    def _count_dead(self, worker: WorkerProcess, failure: str) -> None:
+    def _count_dead(self, worker: Worker) -> None:
         """Count what was lost with a dead process and schedule the next one."""
-        self._lost_earlier += worker.frames_sent - worker.status.frames
-        self._written_earlier += worker.status.frames
-        self._images_lost_earlier += worker.status.images_lost
-        kept = worker.status.view_failure, worker.status.notice
-        self._status = Status(images_done=worker.status.images_done, view_failure=kept[0], notice=kept[1])
-        self._own_failure = failure
+        ended = worker.reap() or "the recording process ended by itself"
+        last = self._status = worker.status
+        self._lost_earlier += worker.frames_sent - last.frames
+        self._written_earlier += last.frames
+        self._images_lost_earlier += last.images_lost
+        self._status = Status(images_done=last.images_done, view_failure=last.view_failure, notice=last.notice)
         self._worker = None
+        self._pause((last.failure or ended).removeprefix("recording failed: "))
+
+    def _pause(self, failure: str) -> None:
+        self._own_failure = failure
         self._restart_at = time.monotonic() + self._restart_pause_s
         _log.error("recording failed: %s; next try in %.0f s", failure, self._restart_pause_s)
         self._restart_pause_s = min(2.0 * self._restart_pause_s, LONGEST_RESTART_PAUSE_S)
@@ -299,66 +333,73 @@ class ProcessRecorder(Recorder):
             self._newest_reference = events.references[-1]
         return events
 
-    def _next_frames(self, worker: WorkerProcess) -> list[msgspec.Raw]:
-        """The frames of the next batch, each encoded separately."""
+    def _next_frames(self, worker: Worker) -> list[msgspec.Raw]:
+        """The frames of the next batch, each encoded separately; as many as the process may hold."""
         frames: list[msgspec.Raw] = []
-        while self._frames and len(frames) < _BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0]):
-            record, counted, image, trace, jaw_reported_m, noted, due, lost = self._frames.popleft()
-            self._images_taken += counted
-            note = None
-            if image is not None and self._ring.takes(image):  # otherwise a refused frame, whose record says why
-                note = self._share(worker, image, due)
-                lost = note is None
+        room = min(_BATCH_FRAMES, self._settings.queue_frames - worker.frames_unwritten)
+        while len(frames) < room and (waiting := self._next_waiting(worker)) is not None:
+            record, image, trace, jaw_reported_m, noted, due, lost = waiting
+            place = None
+            if image is not None:
+                self._images_taken += 1
+                if self._images.takes(image):  # otherwise a refused frame, whose record says why
+                    place = self._share(worker, image, due)
+                    lost = place is None
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
             limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
             worker.limits_sent = limits or worker.limits_sent
             share = None if noted is None else noted.statistic_share
-            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
+            whole = FrameNote(record, place, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
             frames.append(msgspec.Raw(self._encode(whole)))
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # releases the interpreter lock: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
         return frames
 
-    def _wait_for_slot(self, worker: WorkerProcess, head: _Waiting) -> bool:
-        """Whether the next frame stays queued because there is no slot for its image yet and patience is left."""
-        if self._patience_s == 0.0 or head.image is None or self._slot_free(worker, head.due):
-            self._slot_waited_from = None
-            return False
-        now = time.monotonic()
-        self._slot_waited_from = self._slot_waited_from or now
-        return now - self._slot_waited_from < self._patience_s
+    def _next_waiting(self, worker: Worker) -> _Waiting | None:
+        """The next frame; None while there is none, or none with a slot for its image, and patience is left."""
+        if self._held is None:
+            try:
+                self._held, self._held_from_s = self._frames.popleft(), time.monotonic()
+            except IndexError:
+                return None
+        waiting = self._held
+        slot = waiting.image is None or self._slot_free(worker, waiting.due)
+        if not slot and time.monotonic() - self._held_from_s < self._patience_s:
+            return None
+        self._held = None
+        return waiting
 
-    def _slot_free(self, worker: WorkerProcess, due: bool) -> bool:
-        slots = self._ring.slots if due else self._images_before
+    def _slot_free(self, worker: Worker, due: bool) -> bool:
+        slots = self._images.slots if due else self._images_before
         if worker.images_sent - worker.status.images_done >= slots:
-            worker.read_reports()
+            worker.look()
         return worker.images_sent - worker.status.images_done < slots
 
-    def _share(self, worker: WorkerProcess, image: Image, due: bool) -> ImageNote | None:
+    def _share(self, worker: Worker, image: Image, due: bool) -> ImagePlace | None:
         if not self._slot_free(worker, due):
             self._images_without_slot += due
             return None
-        note = self._ring.put(worker.images_sent % self._ring.slots, image)
+        place = self._images.put(worker.images_sent % self._images.slots, image)
         worker.images_sent += 1
-        return note
+        return place
 
     def _finish(self) -> None:
         worker, self._worker = self._worker, None
-        if worker is not None and self._queued == 0 and not worker.heard:
-            worker.discard()  # it hasn't started yet, and there is nothing to record
+        if worker is not None and self._offered == 0 and worker.status.path is None:
+            worker.reap()  # it hasn't started yet, and there is nothing to record
         elif worker is not None:
-            self._own_failure = failure = worker.finish(self._close_before)
+            self._own_failure = failure = worker.finish(self._close_before, complete=not self._waits)
             self._status = worker.status
             if worker.still_writes:
-                self._left_writing = worker.frames_sent - worker.status.frames - worker.status.frames_lost
+                self._left_writing = worker.frames_unwritten
                 _log.info("the recording process still writes the end of the last file, and ends by itself")
             if failure is not None:
                 _log.error("recording incomplete: %s", failure)
         self._own_failure = self._stopped or self._own_failure
         self._health.fault = None
-        self._ring.close()
+        self._images.close()
 
 
 def open_recorder(

@@ -20,10 +20,9 @@ import msgspec
 from benchmarks import scene
 from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
-from gripmon.record.columns import Row
 from gripmon.record.files import FileSeries
+from gripmon.record.pictures import Row, encode_picture
 from gripmon.record.recorder import Events, Scene, make_scene, pack_trace
-from gripmon.record.worker import encode_picture
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),

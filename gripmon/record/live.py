@@ -1,0 +1,94 @@
+"""The live view: rows served to viewers that connect, from a thread of its own that never delays the files."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from gripmon.model.errors import one_line
+from gripmon.record.recorder import LOOPBACK, Events, Scene, ViewSettings
+from gripmon.record.taking import LiveInbox
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+    from gripmon.record.rows import RowWriter
+
+_FLUSH_TIMEOUT_S = 1.0
+_REPEAT_S = 60.0  # what is sent on change only is sent again, for viewers that join after it was dropped
+_RETRY_S = 10.0
+_WAITING_MEMORY_FRACTION = 0.25  # of the view's memory limit, for the pictures of queued rows
+
+
+class LiveStream(LiveInbox):
+    """Serves rows to viewers.  What can't be served is dropped; ``failure`` says why, None while all is well.
+
+    The server keeps what it has sent up to a limit and drops the oldest data; a stalled viewer blocks it, and rows that
+    arrive meanwhile are not shown.  The stream is separate from that of the files, which may begin and end without
+    viewers noticing.
+    """
+
+    def __init__(self, scene: Scene, settings: ViewSettings) -> None:
+        super().__init__(_WAITING_MEMORY_FRACTION * settings.memory_limit_bytes)
+        self._scene, self._settings = scene, settings
+        self._newest_reference = scene.reference
+        self._opened: tuple[rr.RecordingStream, RowWriter] | None = None
+        self._repeat_at = self._retry_at = 0.0
+        self._stalled = False
+
+    def write(self) -> None:
+        """Start or restart the stream if due, and send; a server that a viewer blocks gets nothing more."""
+        load, now_s = self._taken(), time.monotonic()
+        if load.events.references:
+            self._newest_reference = load.events.references[-1]
+        if self._opened is None and now_s < self._retry_at:
+            return
+        try:
+            stream, writer = self._opened = self._opened or self._begin()
+            if not self._stalled:
+                if now_s >= self._repeat_at:
+                    self._repeat_at = now_s + _REPEAT_S
+                    writer.repeat()
+                    if self._newest_reference not in load.events.references:
+                        load.events = Events.at_first(self._newest_reference) + load.events
+                writer.write(load.rows, load.events)
+                writer.write_pictures(load.late)
+            self._flush(stream)
+            self.failure = None
+        except Exception as error:  # noqa: BLE001 - rerun raises its own types; none may affect the files
+            self._opened, self._stalled = None, False
+            self._retry_at = now_s + _RETRY_S
+            self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({one_line(error)})"
+
+    def close(self) -> None:
+        """End the server; while a viewer blocks it, this doesn't return."""
+        if self._opened is not None:
+            self._opened[0].disconnect()
+
+    def _flush(self, stream: rr.RecordingStream) -> None:
+        """Wait until everything is sent; a server that is gone fails at once, a blocked one after a timeout."""
+        begun_s, was_stalled = time.monotonic(), self._stalled
+        try:
+            stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+            self._stalled = False
+        except Exception:
+            if time.monotonic() - begun_s < 0.9 * _FLUSH_TIMEOUT_S:
+                raise
+            self._stalled = True
+        if was_stalled and not self._stalled:
+            self._repeat_at = 0.0  # changes may have been among what was not shown
+
+    def _begin(self) -> tuple[rr.RecordingStream, RowWriter]:
+        import rerun as rr
+
+        from gripmon.record.columns import APPLICATION_ID
+        from gripmon.record.rows import RowWriter
+        from gripmon.record.scene import make_blueprint
+
+        stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+        limit = f"{self._settings.memory_limit_bytes}B"
+        stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
+        stream.send_recording_name(f"{self._scene.name} (live)")
+        stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
+        self._repeat_at = 0.0
+        return stream, RowWriter(stream, self._scene, 0)
