@@ -279,9 +279,13 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
 def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> None:
     moved = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2)
     writer = recorder(tmp_path)
-    for i in range(12):
-        writer.frame(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
+    writer.frame(frame(0), record(0), lambda: None)
+    wait_until(lambda: writer.frames_written == 1)
     writer.event(moved)
+    for i in range(1, 12):
+        if i == 7:
+            wait_until(lambda: writer.frames_written == 7)  # it is written with none of its own
+        writer.frame(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
     writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)

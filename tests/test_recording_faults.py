@@ -294,7 +294,7 @@ def test_close_releases_everything(tmp_path: Path) -> None:
     children = {child.pid for child in process.children()}  # other tests may have left some
     writer = recorder(tmp_path / "run")
     offer(writer, 0, 10)
-    assert {child.pid for child in process.children()} > children
+    wait_until(lambda: {child.pid for child in process.children()} > children)
     assert "gripmon-images" in Path("/proc/self/maps").read_text()
     writer.close(60.0)
     writer.close(60.0)

@@ -172,7 +172,7 @@ def view(arguments: Arguments) -> int:
     ends with Ctrl-C, or when the window is closed, and leaves nothing running.
     """
     from gripmon.record.read import rrd_files
-    from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
+    from gripmon.record.viewer import NativeViewer, ViewerError, WebPage, free_port, has_display, is_free
 
     files = rrd_files(arguments.recording)
     if arguments.port is not None and not is_free(arguments.port):
@@ -183,7 +183,8 @@ def view(arguments: Arguments) -> int:
                 viewer = NativeViewer([str(path) for path in files], tied=True)
                 opened.callback(viewer.close)
                 return EXIT_FAILED if viewer.wait() else EXIT_DONE
-            page = opened.enter_context(serve_files(files, arguments.port or free_port(_PORT)))
+            page = WebPage(arguments.port or free_port(_PORT), [str(path) for path in files])
+            opened.callback(page.close)
             print(f"{page.url}\n(stop with Ctrl-C)", flush=True)
             threading.Event().wait()
     except ViewerError as error:

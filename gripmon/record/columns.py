@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -16,7 +15,6 @@ from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertRecord,
-    Meta,
     RecordedCommand,
     Severity,
     State,
@@ -26,7 +24,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events, RecordingSettings, Scene
+from gripmon.record.recorder import Events, Scene
 
 APPLICATION_ID = "gripmon"
 _CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame
@@ -218,60 +216,6 @@ def _configuration(colours: dict[State, Colour] | dict[Verdict, Colour]) -> rr.S
     return rr.StateConfiguration(values=[str(value) for value in colours], colors=list(colours.values()))
 
 
-class Writer:
-    """Writes the rows of its kind, a wrist camera's frames or a second camera's pulses, into one file."""
-
-    def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int, about: str):
-        """Writes the description of this file and the monitor's configuration; ``about`` is text for people."""
-        self._send = Sender(stream)
-        self._events = EventWriter(self._send)
-        meta = Meta(
-            name=scene.name,
-            recording_id=scene.recording_id,
-            robot=scene.robot,
-            camera=scene.camera,
-            gripper=scene.gripper.name,
-            version=scene.version,
-            file_number=file_number,
-            started_ns=time.time_ns(),
-            image_policy=_image_policy(scene.settings),
-            has_truth=scene.has_truth,
-        )
-        self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
-        if scene.configuration is not None:
-            self._send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
-        about = f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, {about}\n"
-        self._send.static("about", rr.TextDocument(about, media_type="text/markdown"))
-
-    def write(self, rows: Sequence[Any], events: Events) -> None:
-        """Send everything since the last call."""
-        raise NotImplementedError
-
-    def write_pictures(self, rows: Sequence[Any]) -> None:
-        """Send the pictures of rows that were written earlier without them."""
-        raise NotImplementedError
-
-    def repeat(self) -> None:
-        """With the next row, write again what is otherwise only written on change."""
-        self._events.repeat()
-
-    def finish(self) -> None:
-        """Called when nothing more is written to this file."""
-
-    def _write_records(self, rows: Sequence[Row]) -> None:
-        self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
-
-
-def _image_policy(settings: RecordingSettings) -> str:
-    """Which images are kept, and how, in words."""
-    kind = "PNG" if settings.image_format == "png" else f"JPEG {settings.jpeg_quality} %"
-    rate = f"{settings.image_rate_hz:g} images/s" if settings.image_rate_hz > 0.0 else "no images but"
-    every = f", of every {settings.image_every}. frame" if settings.image_every > 0 else ""
-    around_s = settings.around_alert_s
-    around = f", all within {around_s:g} s of a warning or error" if around_s > 0.0 else ""
-    return f"{kind}, {rate}{every}, one at every alert and change{around}"
-
-
 def pose_columns(poses: Sequence[Transform]) -> rr.ComponentColumnList:
     return rr.Transform3D.columns(
         translation=[pose.translation_m for pose in poses], quaternion=[pose.rotation_xyzw for pose in poses]
@@ -291,22 +235,14 @@ AXIS = rrb.TimeAxis(link="LinkToGlobal")
 
 
 def plot(
-    origin: str,
-    contents: str | list[str],
-    name: str,
-    *,
-    legend: bool = True,
-    shown: tuple[float, float] | None = None,
+    origin: str, contents: str | list[str], name: str, *, legend: bool = True, shown: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
     """Curves over the shared time axis; ``shown`` is the range of values, None: automatic."""
     return rrb.TimeSeriesView(
-        origin=origin,
-        contents=contents,
-        name=name,
-        axis_x=AXIS,
+        origin=origin, contents=contents, name=name, axis_x=AXIS,
         axis_y=None if shown is None else rrb.ScalarAxis(range=shown),
         plot_legend=None if legend else rrb.PlotLegend(visible=False),
-    )
+    )  # fmt: skip
 
 
 def image_view(scene: Scene, origin: str, image: str, legend: str) -> rrb.Spatial2DView:

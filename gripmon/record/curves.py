@@ -84,10 +84,14 @@ def _error_mm(row: Row, reference_tcp_m: _Position | None) -> _Values:
     return np.subtract(shift_mm, truth_mm).tolist() if shift_mm and truth_mm else []
 
 
-def _bound(bound: Protection | SinceReference | Absolute | None, unit: str) -> _Values:
-    if bound is None:
-        return None
-    return [1e3 * bound.position_m if unit == "mm" else _DEG * bound.rotation_rad]
+def _bound(name: str, unit: str) -> Callable[[Row, _Position | None], _Values]:
+    def values(row: Row, _: _Position | None) -> _Values:
+        bound: Protection | SinceReference | Absolute | None = getattr(row.record, name)
+        if bound is None:
+            return None
+        return [1e3 * bound.position_m if unit == "mm" else _DEG * bound.rotation_rad]
+
+    return values
 
 
 def _both(size: int, raw: Sequence[float], other: Sequence[float]) -> Sequence[float]:
@@ -139,6 +143,10 @@ def _edge_residuals_px(trace: TraceNote) -> tuple[NDArray[np.float32], NDArray[n
     return distances[used], distances[~used]
 
 
+def _statistic(name: str) -> Callable[[Row, _Position | None], _Values]:
+    return lambda row, _: None if row.picture is None else [getattr(row.picture, name)]
+
+
 def _of_limits(values: Callable[[Limits], _Values]) -> Callable[[Row, _Position | None], _Values]:
     return lambda row, _: None if row.limits is None else values(row.limits)
 
@@ -176,14 +184,11 @@ FRAME_CURVES = (
           lambda r, _: [] if r.record.drift is None else [_DEG * r.record.drift.rotation_rad]),
     Curve("drift/truth_mm", [f"true {axis}" for axis in "xyz"], _PALER, 6.0, _truth_mm),
     Curve("drift/error_mm", [*"xyz"], _AXES, 1.0, _error_mm),
-    *(curve for unit in ("mm", "deg") for curve in (
-        Curve(f"protection/level_{unit}", ["protection level"], _WHOLE, 1.5,
-              lambda r, _, unit=unit: _bound(r.record.protection, unit)),
-        Curve(f"protection/since_reference_{unit}", ["since the reference"], _FAINT, 1.0,
-              lambda r, _, unit=unit: _bound(r.record.since_reference, unit)),
-        Curve(f"protection/absolute_{unit}", ["absolute"], _FAINT, 1.0,
-              lambda r, _, unit=unit: _bound(r.record.absolute, unit)),
-    )),
+    *(Curve(f"protection/{path}_{unit}", [named], colours, width, _bound(name, unit)) for unit in ("mm", "deg")
+      for path, name, named, colours, width in (
+          ("level", "protection", "protection level", _WHOLE, 1.5),
+          ("since_reference", "since_reference", "since the reference", _FAINT, 1.0),
+          ("absolute", "absolute", "absolute", _FAINT, 1.0))),
     Curve("transform", [*_POSE, *(f"{name} smoothed" for name in _POSE)], _ANY, 0.0, _poses),
     Curve("sigma/tcp_um", [*"xyz"], _AXES, 1.5, _sigmas(_XYZ, 1e6)),
     Curve("sigma/rotation_deg", [*"xyz"], _AXES, 1.5, _sigmas(_TURNS, _DEG)),
@@ -227,7 +232,7 @@ LIMIT_CURVES = (
 """Of frames whose limits are known: those in force then."""
 
 PICTURE_CURVES = tuple(
-    Curve(f"image/{name}", [], _ANY, 0.0, lambda r, _, name=name: [getattr(r.picture, name)])  # type: ignore[misc]
+    Curve(f"image/{name}", [], _ANY, 0.0, _statistic(name))
     for name in ("mean_grey", "contrast_grey", "saturated_percent", "sharpness")
 )
 """Of recorded images, which may be written later than the rest of their frames."""

@@ -116,8 +116,8 @@ class FileSeries(FileInbox):
             self._pins.pin(file.path, tuple(self._alerts))
         with self._asking_disk():
             missing = self._write_pins() or space_missing(self._directory, settings.min_free_bytes)
-            old = file.frames > 0 and time.monotonic() - file.begun_s >= settings.max_file_s
-            full = file.bytes >= settings.max_file_bytes or old or not self._fits(file)
+            old = time.monotonic() - file.begun_s >= settings.max_file_s
+            full = file.frames > 0 and (old or file.bytes >= settings.max_file_bytes or not self._fits(file))
         if missing or full:
             self._end()
         if missing:

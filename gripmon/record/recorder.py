@@ -8,7 +8,7 @@ ever blocks the interpreter in which the loop runs.  The daemon itself never imp
 from __future__ import annotations
 
 import uuid
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -42,72 +42,34 @@ class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """What is recorded, how much of it, and what the disk must keep free."""
 
     enabled: Annotated[bool, Meta(description="false: nothing is recorded")] = True
-    directory: Annotated[str, Meta(min_length=1, description="where the .rrd files go; made if it is missing")] = (
-        "recordings"
-    )
-    image_rate_hz: Annotated[
-        float,
-        Meta(
-            ge=0.0,
-            le=1000.0,
-            description="rate of recorded images and overlays in capture time, besides those at alerts and "
-            "state changes (Hz)",
-        ),
-    ] = 10.0
-    image_every: Annotated[
-        int, Meta(ge=0, description="in addition, the image of every n-th frame; 1: every frame; 0: none (frames)")
-    ] = 0
-    around_alert_s: Annotated[
-        float,
-        Meta(
-            ge=0.0,
-            le=600.0,
-            description="time before and after an alert in which every image is kept; 0: only the usual images (s)",
-        ),
-    ] = 5.0
-    ring_bytes: Annotated[
-        int, Meta(ge=0, description="memory for the images before an alert; the oldest are dropped (bytes)")
-    ] = 100_000_000
-    image_format: Annotated[Literal["jpeg", "png"], Meta(description="png is lossless and about five times larger")] = (
-        "jpeg"
-    )
+    directory: Annotated[str, Meta(
+        min_length=1, description="where the .rrd files go; made if it is missing")] = "recordings"
+    image_rate_hz: Annotated[float, Meta(ge=0.0, le=1000.0, description="rate of recorded images and overlays in "
+        "capture time, besides those at alerts and state changes (Hz)")] = 10.0
+    image_every: Annotated[int, Meta(
+        ge=0, description="in addition, the image of every n-th frame; 1: every frame; 0: none (frames)")] = 0
+    around_alert_s: Annotated[float, Meta(ge=0.0, le=600.0, description="time before and after an alert in which every "
+        "image is kept; 0: only the usual images (s)")] = 5.0
+    ring_bytes: Annotated[int, Meta(
+        ge=0, description="memory for the images before an alert; the oldest are dropped (bytes)")] = 100_000_000
+    image_format: Annotated[Literal["jpeg", "png"], Meta(
+        description="png is lossless and about five times larger")] = "jpeg"
     jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="JPEG quality (%)")] = 85
-    queue_frames: Annotated[
-        int,
-        Meta(ge=1, le=100_000, description="length of the queue to the recording; when it is full, frames are dropped"),
-    ] = 512
-    queue_images: Annotated[
-        int,
-        Meta(
-            ge=1,
-            le=256,
-            description="length of the queue of images to the recording; when it is full, images are dropped",
-        ),
-    ] = 8
-    flush_period_s: Annotated[
-        float,
-        Meta(
-            ge=0.05, le=10.0, description="period at which the file is written, and the most that a crash can lose (s)"
-        ),
-    ] = 0.5
-    min_free_bytes: Annotated[int, Meta(ge=0, description="free disk space below which recording pauses (bytes)")] = (
-        200_000_000
-    )
-    max_file_bytes: Annotated[
-        int, Meta(ge=100_000, description="size at which a file is closed and the next one begun (bytes)")
-    ] = 500_000_000
-    max_file_s: Annotated[
-        float, Meta(ge=1.0, description="age at which a file that holds frames is closed and the next one begun (s)")
-    ] = 300.0
-    budget_bytes: Annotated[
-        int,
-        Meta(
-            ge=0,
-            description="limit for all recordings of this robot and camera in the directory, earlier runs "
-            "included: beyond it the oldest without a .pinned file are deleted; at least 4 * "
-            "max_file_bytes; 0: no limit (bytes)",
-        ),
-    ] = 50_000_000_000
+    queue_frames: Annotated[int, Meta(ge=1, le=100_000, description="length of the queue to the recording; when it is "
+        "full, frames are dropped")] = 512
+    queue_images: Annotated[int, Meta(ge=1, le=256, description="length of the queue of images to the recording; when "
+        "it is full, images are dropped")] = 8
+    flush_period_s: Annotated[float, Meta(ge=0.05, le=10.0, description="period at which the file is written, and the "
+        "most that a crash can lose (s)")] = 0.5
+    min_free_bytes: Annotated[int, Meta(
+        ge=0, description="free disk space below which recording pauses (bytes)")] = 200_000_000
+    max_file_bytes: Annotated[int, Meta(
+        ge=100_000, description="size at which a file is closed and the next one begun (bytes)")] = 500_000_000
+    max_file_s: Annotated[float, Meta(
+        ge=1.0, description="age at which a file that holds frames is closed and the next one begun (s)")] = 300.0
+    budget_bytes: Annotated[int, Meta(ge=0, description="limit for all recordings of this robot and camera in the "
+        "directory, earlier runs included: beyond it the oldest without a .pinned file are deleted; at least 4 * "
+        "max_file_bytes; 0: no limit (bytes)")] = 50_000_000_000
 
     def __post_init__(self) -> None:
         if 0 < self.budget_bytes < 4 * self.max_file_bytes:
@@ -196,15 +158,12 @@ def make_scene(
     camera: Camera,
     gripper: Gripper,
     reference: ReferenceRecord,
-    has_truth: bool = False,
-    configuration: RecordedConfiguration | None = None,
-    view: ViewSettings | None = None,
+    **more: Any,
 ) -> Scene:
-    """The scene, with an id of its own."""
+    """The scene, with an id of its own.  ``more``: its optional fields."""
     return Scene(
         name=name, recording_id=f"{name}-{uuid.uuid4()}", directory=directory, settings=settings, robot=robot,
-        camera=camera_name, lens=camera.settings, gripper=gripper.model, reference=reference, has_truth=has_truth,
-        configuration=configuration, view=view,
+        camera=camera_name, lens=camera.settings, gripper=gripper.model, reference=reference, **more,
     )  # fmt: skip
 
 
@@ -258,15 +217,11 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
         return Events(references=[] if reference is None else [reference])
 
     def __bool__(self) -> bool:
-        return bool(self.alerts or self.references or self.commands or self.states)
+        return any(msgspec.structs.astuple(self))
 
     def __add__(self, later: Events) -> Events:
-        return Events(
-            self.alerts + later.alerts,
-            self.references + later.references,
-            self.commands + later.commands,
-            self.states + later.states,
-        )
+        both = zip(msgspec.structs.astuple(self), msgspec.structs.astuple(later), strict=True)
+        return Events(*(a + b for a, b in both))
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):

@@ -61,7 +61,8 @@ class Inbox:
         with self._changed:
             self._load.rows += rows
             self._bound(self._load)
-            self._changed.notify_all()
+            if self._much_waits():
+                self._changed.notify_all()
 
     def add_pictures(self, rows: Sequence[Row]) -> None:
         """Pictures of frames that were added before without them."""
@@ -194,6 +195,7 @@ class Taker:
         self._around_ns = round(1e9 * settings.around_alert_s)
         self._moments = Moments(self._around_ns)
         self._before = PictureRing(self._around_ns, settings.ring_bytes)
+        self._late: list[Row] = []
         self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images for which there was no room
         self._images_lost = self._images_done = 0
         self._limits: Limits | None = None
@@ -237,16 +239,19 @@ class Taker:
     def _take(self, batch: Batch) -> None:
         for inbox in self._inboxes:
             inbox.add_events(batch.events)
-        for note in batch.frames:
-            self._take_frame(note)
+        rows = [self._row(note) for note in batch.frames]
         for alert in batch.events.alerts:
             # Its own stamp may be from another clock than that of the frames.
             self._on_alert(alert, alert.seq, alert.stamp_ns, self._newest_ns)
+        late, self._late = self._late, []
+        for inbox in self._inboxes:
+            inbox.add_frames(rows)
+            inbox.add_pictures(late)
         while self._files.full and not self._files.disk_hangs:  # a slow disk: who can wait does so
             time.sleep(_SLOW_DISK_POLL_S)
             self.report()
 
-    def _take_frame(self, note: FrameNote) -> None:
+    def _row(self, note: FrameNote) -> Row:
         """Around an alert every picture is written; otherwise those that are due, and the rest is kept for an alert."""
         record, picture = note.record, None
         self._newest_ns = record.stamp_ns
@@ -265,8 +270,7 @@ class Taker:
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
-        for inbox in self._inboxes:
-            inbox.add_frames([row])
+        return row
 
     def _count_lost(self) -> None:
         """Count images around an alert that never arrived here."""
@@ -286,6 +290,4 @@ class Taker:
         if self._around_ns > 0 and near_ns is not None:
             self._moments.add(near_ns)
             self._count_lost()
-            pictures = self._before.take(self._moments)
-            for inbox in self._inboxes:
-                inbox.add_pictures(pictures)
+            self._late += self._before.take(self._moments)

@@ -1,28 +1,22 @@
-"""rerun's viewer as a separate process, which ends with its parent unless it is a window; and finished recordings on
-its web page, served unchanged from disk.
-"""
+"""rerun's viewer as a separate process, which ends with its parent unless it is a window."""
 
 from __future__ import annotations
 
-import functools
-import http.server
 import importlib.util
 import os
 import socket
 import subprocess
 import sys
-import threading
 import time
 import urllib.parse
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gripmon.record.recorder import LOOPBACK
 
 _START_S = 20.0
 _STOP_S = 5.0
+_SERVED_MEMORY = "50%"  # of the machine's, for files that are served: of larger ones the end is shown
 # The kernel kills the viewer when its parent ends, however that ends; if the parent is gone already, it isn't started.
 _TIED = (
     "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
@@ -50,9 +44,14 @@ def is_free(port: int) -> bool:
         return True
 
 
-def free_port(preferred: int) -> int:
-    """The preferred loopback port, or any free one if that is in use."""
-    if is_free(preferred):
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((LOOPBACK, port)) == 0
+
+
+def free_port(preferred: int = 0) -> int:
+    """The preferred loopback port, or any free one if that is in use, or 0."""
+    if preferred and is_free(preferred):
         return preferred
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
@@ -63,19 +62,24 @@ class WebPage:
     """Serves the page ``url`` with rerun's web viewer on loopback, until :meth:`close` or the end of this process."""
 
     def __init__(self, web_port: int, sources: Sequence[str]) -> None:
-        """Returns when the page, which shows these sources, can be loaded.  Raises :class:`ViewerError`."""
+        """``sources``: the address of a stream, or paths of files, which the viewer's process then serves, too.
+
+        Returns when the page can be loaded.  Raises :class:`ViewerError`.
+        """
         if not is_free(web_port):
             raise ViewerError(f"port {web_port} of {LOOPBACK} is in use; another one")
-        wanted = "&".join(f"url={urllib.parse.quote(source, safe='')}" for source in sources)
-        self.url = f"http://{LOOPBACK}:{web_port}/?{wanted}"
-        # With a source to show, it serves the page only, no data.
-        command = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), sources[0]]
+        ports, shown = [web_port], sources[0]
+        command = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(web_port), *sources]
+        if "://" not in shown:
+            ports.append(free_port())
+            shown = f"rerun+http://{LOOPBACK}:{ports[1]}/proxy"
+            command += ["--port", str(ports[1]), "--server-memory-limit", _SERVED_MEMORY]
+        self.url = f"http://{LOOPBACK}:{web_port}/?url={urllib.parse.quote(shown, safe='')}"
         self._process = _start(command, tied=True)
         end_s = time.monotonic() + _START_S
         while time.monotonic() < end_s and self._process.poll() is None:
-            with socket.socket() as probe:
-                if probe.connect_ex((LOOPBACK, web_port)) == 0:
-                    return
+            if all(_listens(port) for port in ports):
+                return
             time.sleep(0.02)
         self.close()
         raise ViewerError("rerun's web viewer doesn't start; `rerun --serve-web` may say why")
@@ -129,51 +133,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-@contextmanager
-def serve_files(files: Sequence[Path], web_port: int) -> Iterator[WebPage]:
-    """Serve the page and, from this process, the files that it shows, on loopback until the context ends.
-
-    The standard library's server is enough: the page needs GET and HEAD of a few named files, and only these are
-    served.  Raises :class:`ViewerError`.
-    """
-    named = {f"/{number}/{urllib.parse.quote(path.name)}": path for number, path in enumerate(files)}
-    handler = functools.partial(_Files, named, f"http://{LOOPBACK}:{web_port}")
-    try:
-        server = http.server.ThreadingHTTPServer((LOOPBACK, 0), handler)
-    except OSError as error:
-        raise ViewerError(f"no port is free on {LOOPBACK} ({error.strerror})") from None
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, name="files", daemon=True).start()
-    with ExitStack() as opened:
-        opened.callback(server.server_close)
-        opened.callback(server.shutdown)
-        page = WebPage(web_port, [f"http://{LOOPBACK}:{server.server_port}{name}" for name in named])
-        opened.callback(page.close)
-        yield page
-
-
-class _Files(http.server.SimpleHTTPRequestHandler):
-    """Serves these files, and no others, to the page that was opened for them."""
-
-    def __init__(self, named: dict[str, Path], origin: str, *details: Any) -> None:
-        self._named, self._origin = named, origin
-        super().__init__(*details)
-
-    def translate_path(self, path: str) -> str:
-        """The file; for any other path an empty string, which is not found."""
-        return str(self._named.get(path, ""))
-
-    def end_headers(self) -> None:
-        """Add the header that lets the page read the file."""
-        self.send_header("Access-Control-Allow-Origin", self._origin)
-        super().end_headers()
-
-    def copyfile(self, source: Any, outputfile: Any) -> None:
-        """Stop quietly if the page is closed."""
-        with suppress(BrokenPipeError, ConnectionResetError):
-            super().copyfile(source, outputfile)
-
-    def log_message(self, format: str, *values: Any) -> None:
-        """Log nothing."""

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
@@ -24,12 +23,8 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Image,
-    MeasurementTrace,
-    MonitorNotes,
     RecordedConfiguration,
     ReferenceRecord,
-    State,
-    Verdict,
 )
 from gripmon.model.shared_images import ImagePlace, SharedImages
 from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
@@ -45,6 +40,7 @@ from gripmon.record.recorder import (
     make_scene,
     pack_trace,
 )
+from gripmon.record.waiting import Waiting, WaitingFrames
 
 _log = logging.getLogger(__name__)
 
@@ -61,20 +57,6 @@ _FOR_THE_DAEMON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Truth = Callable[[int], tuple[float, float, float] | None]
 
 
-class _Waiting(NamedTuple):
-    """A frame in the queue.  ``image``: None if it isn't kept; ``due``: it is always written, not only around an alert;
-    ``lost``: there was no room for it.
-    """
-
-    record: FrameRecord
-    image: Image | None
-    trace: MeasurementTrace | None
-    jaw_reported_m: float | None
-    notes: MonitorNotes | None
-    due: bool
-    lost: bool
-
-
 class ProcessRecorder(Recorder):
     """Records through a separate process.
 
@@ -86,24 +68,15 @@ class ProcessRecorder(Recorder):
 
     def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
         self._scene, self._truth_tcp_m, self._patience_s = scene, truth_tcp_m, patience_s
-        self._settings = settings = scene.settings
-        self._keeps_before = settings.around_alert_s > 0.0
-        # Images kept in case of an alert leave room for those that are due.
-        self._images_before = max(1, settings.queue_images - settings.queue_images // 4)
-        self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
-        # Written by the loop's thread only.
-        self._offered = self._overflowed = 0
-        self._images_queued = self._images_not_queued = 0
-        self._image_stamp_ns: int | None = None
-        self._shown: tuple[State, Verdict, str, int] | None = None
+        settings = scene.settings
+        # Filled by the loop's thread, emptied by the hand-over thread.
+        self._frames = WaitingFrames(settings)
         self._newest_record: FrameRecord | None = None
-        # Appended to by the loop's thread, emptied by the hand-over thread.
-        self._frames: deque[_Waiting] = deque()
         self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
-        self._held: _Waiting | None = None  # taken from the queue; waits for a slot for its image
+        self._held: Waiting | None = None  # taken from the queue; waits for a slot for its image
         self._held_from_s = math.inf
-        self._images_taken = self._images_without_slot = self._images_lost_earlier = 0
+        self._images_without_slot = self._images_lost_earlier = 0
         self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
         self._lost_earlier = self._written_earlier = 0
         self._left_writing = 0  # frames that the process is still writing when this object is closed
@@ -124,20 +97,18 @@ class ProcessRecorder(Recorder):
     @property
     def dropped(self) -> int:
         """Frames missing from the recording: the queue was full, the process died, or nothing could be written."""
-        return self._overflowed + self._lost_earlier + self._status.frames_lost
+        return self._frames.dropped + self._lost_earlier + self._status.frames_lost
 
     @property
     def images_dropped(self) -> int:
         """Images that were due, or around an alert, for which there was no room; their frames are recorded."""
-        earlier = self._images_not_queued + self._images_without_slot + self._images_lost_earlier
+        earlier = self._frames.images_dropped + self._images_without_slot + self._images_lost_earlier
         return earlier + self._status.images_lost
 
     @property
     def has_room(self) -> bool:
         """Whether the next frame and its image would be accepted; also true while recording fails."""
-        images = self._images_before if self._keeps_before else self._settings.queue_images
-        waiting = self._images_queued - self._images_taken
-        return self.failure is not None or (len(self._frames) < self._settings.queue_frames and waiting < images)
+        return self.failure is not None or self._frames.has_room
 
     @property
     def frames_written(self) -> int:
@@ -167,24 +138,7 @@ class ProcessRecorder(Recorder):
         self._newest_record = record
         if self._patience_s > 0.0:
             self._wait_for_room()
-        if len(self._frames) >= self._settings.queue_frames:
-            self._drop_oldest()
-        shown = (record.state, record.verdict, record.reference_id, record.revision)
-        self._offered += 1
-        due = bool(self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown)
-        self._shown = shown
-        # An image that isn't due is kept in case of an alert; its trace would cost the loop more than all else here.
-        wanted = due or self._keeps_before
-        room = self._settings.queue_images if due else self._images_before
-        kept = wanted and self._images_queued - self._images_taken < room
-        lost = wanted and not kept and frame.image is not None
-        if kept:
-            self._images_queued += 1
-            self._image_stamp_ns = record.stamp_ns if due else self._image_stamp_ns
-        self._images_not_queued += due and lost
-        measured, noted = trace() if kept and due else None, None if notes is None else notes()
-        image = frame.image if kept else None
-        self._frames.append(_Waiting(record, image, measured, frame.jaw_opening_m, noted, due, lost))
+        self._frames.offer(frame, record, trace, notes)
 
     def event(self, event: Event) -> None:
         """Record what is neither in the scene nor in a frame's record."""
@@ -210,32 +164,14 @@ class ProcessRecorder(Recorder):
             worker.kill()  # it doesn't take what it is sent
         self._thread.join()
         self._frames.clear()
-        self._lost_earlier = self._offered - self._overflowed - self.frames_written - self._left_writing
-        self._lost_earlier -= self._status.frames_lost
+        handed = self._frames.offered - self._frames.dropped
+        self._lost_earlier = handed - self.frames_written - self._left_writing - self._status.frames_lost
         self._log_losses()
 
     def _wait_for_room(self) -> None:
         end = time.monotonic() + self._patience_s
         while not self.has_room and time.monotonic() < end:
             time.sleep(ROOM_POLL_S)
-
-    def _drop_oldest(self) -> None:
-        try:
-            oldest = self._frames.popleft()
-        except IndexError:  # the hand-over thread took the last one meanwhile
-            return
-        self._overflowed += 1
-        self._images_queued -= oldest.image is not None
-        self._images_not_queued -= oldest.due and oldest.lost  # they count images of other frames
-
-    def _image_is_due(self, stamp_ns: int) -> bool:
-        every = self._settings.image_every
-        if every > 0 and (self._offered - 1) % every == 0:
-            return True
-        if self._image_interval_ns is None:
-            return False
-        # A capture time that jumps backwards starts a new interval.
-        return self._image_stamp_ns is None or not 0 <= stamp_ns - self._image_stamp_ns < self._image_interval_ns
 
     def _run(self) -> None:
         # Processes inherit the mask of the thread that starts them; multiprocessing's own helper would undo it.
@@ -259,7 +195,7 @@ class ProcessRecorder(Recorder):
 
     @property
     def _waits(self) -> bool:
-        return bool(self._frames) or self._held is not None
+        return len(self._frames) > 0 or self._held is not None
 
     def _hand_over(self) -> None:
         worker = self._running_worker()
@@ -336,15 +272,13 @@ class ProcessRecorder(Recorder):
     def _next_frames(self, worker: Worker) -> list[msgspec.Raw]:
         """The frames of the next batch, each encoded separately; as many as the process may hold."""
         frames: list[msgspec.Raw] = []
-        room = min(_BATCH_FRAMES, self._settings.queue_frames - worker.frames_unwritten)
+        room = min(_BATCH_FRAMES, self._scene.settings.queue_frames - worker.frames_unwritten)
         while len(frames) < room and (waiting := self._next_waiting(worker)) is not None:
             record, image, trace, jaw_reported_m, noted, due, lost = waiting
             place = None
-            if image is not None:
-                self._images_taken += 1
-                if self._images.takes(image):  # otherwise a refused frame, whose record says why
-                    place = self._share(worker, image, due)
-                    lost = place is None
+            if image is not None and self._images.takes(image):  # otherwise a refused frame, whose record says why
+                place = self._share(worker, image, due)
+                lost = place is None
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
             limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
@@ -357,22 +291,19 @@ class ProcessRecorder(Recorder):
         worker.frames_sent += len(frames)
         return frames
 
-    def _next_waiting(self, worker: Worker) -> _Waiting | None:
+    def _next_waiting(self, worker: Worker) -> Waiting | None:
         """The next frame; None while there is none, or none with a slot for its image, and patience is left."""
         if self._held is None:
-            try:
-                self._held, self._held_from_s = self._frames.popleft(), time.monotonic()
-            except IndexError:
-                return None
+            self._held, self._held_from_s = self._frames.take(), time.monotonic()
         waiting = self._held
-        slot = waiting.image is None or self._slot_free(worker, waiting.due)
+        slot = waiting is None or waiting.image is None or self._slot_free(worker, waiting.due)
         if not slot and time.monotonic() - self._held_from_s < self._patience_s:
             return None
         self._held = None
         return waiting
 
     def _slot_free(self, worker: Worker, due: bool) -> bool:
-        slots = self._images.slots if due else self._images_before
+        slots = self._images.slots if due else self._frames.images_before
         if worker.images_sent - worker.status.images_done >= slots:
             worker.look()
         return worker.images_sent - worker.status.images_done < slots
@@ -387,7 +318,7 @@ class ProcessRecorder(Recorder):
 
     def _finish(self) -> None:
         worker, self._worker = self._worker, None
-        if worker is not None and self._offered == 0 and worker.status.path is None:
+        if worker is not None and self._frames.offered == 0 and worker.status.path is None:
             worker.reap()  # it hasn't started yet, and there is nothing to record
         elif worker is not None:
             self._own_failure = failure = worker.finish(self._close_before, complete=not self._waits)
@@ -434,7 +365,7 @@ def open_recorder(
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
     scene = make_scene(
-        settings, str(where.resolve()), name, robot, camera_name, camera, gripper, reference, truth_tcp_m is not None,
-        configuration, view,
+        settings, str(where.resolve()), name, robot, camera_name, camera, gripper, reference,
+        has_truth=truth_tcp_m is not None, configuration=configuration, view=view,
     )  # fmt: skip
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
