@@ -11,7 +11,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Iterator
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -46,7 +47,8 @@ class Worker:
             fcntl.fcntl(self._batches.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self._process = _Process(scene, images, theirs, told)
         try:
-            self._process.start()
+            with _no_main_module():
+                self._process.start()
         except OSError:
             self._batches.close()
             self._reports.close()
@@ -130,6 +132,17 @@ class Worker:
         """Kill it, from any thread: a blocked :meth:`send` then returns."""
         with contextlib.suppress(ValueError):  # it is closed already
             self._process.kill()
+
+
+@contextlib.contextmanager
+def _no_main_module() -> Iterator[None]:
+    """The new process would otherwise import the program's main module: anybody's script, which may have no guard."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 class _Process(SpawnProcess):

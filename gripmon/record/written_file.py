@@ -18,11 +18,23 @@ from pathlib import Path
 import rerun as rr
 
 from gripmon.record.columns import APPLICATION_ID
-from gripmon.record.container import free_closed_streams
+from gripmon.record.container import RerunChangedError, free_closed_streams
 from gripmon.record.recorder import Scene
 from gripmon.record.rows import RowWriter
 
 _ENCODED_WITHIN_S = 60.0
+
+
+rr.set_strict_mode(True)  # else rerun only warns
+
+
+def _free_earlier_files() -> None:
+    try:
+        free_closed_streams()
+    except RerunChangedError:
+        raise
+    except RuntimeError:
+        pass  # a live view whose server has ended: it says so itself
 
 
 class WrittenFile:
@@ -45,7 +57,7 @@ class WrittenFile:
         self.last_ns: int | None = None
         self.frames = 0
         self.bytes = 0  # on disk, whole messages
-        free_closed_streams()  # of earlier files
+        _free_earlier_files()
         self._freed = 0  # from the beginning of the memory
         self._asking_disk = asking_disk
         with asking_disk():
