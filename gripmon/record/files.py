@@ -25,16 +25,29 @@ from gripmon.record.recorder import Events, Scene
 from gripmon.record.taking import FileInbox, Load
 
 if TYPE_CHECKING:
+    from gripmon.record.pictures import Row
     from gripmon.record.written_file import WrittenFile
 
 _FIRST_RETRY_S = 1.0
 _LONGEST_RETRY_S = 30.0
 _PIN_AROUND_S = 5.0  # pinned before and after an alert at least, even if no images are kept around it
 _FILES_REMEMBERED = 64
+_ROWS_A_CHUNK = 32
+_PICTURE_BYTES_A_CHUNK = 1_000_000
 _PICTURES_A_CHUNK = 16
 _ALERTS_KEPT = 64  # while nothing can be written: the next file then explains it
 # Free space needed to resume, over the minimum: otherwise recording would start and stop at every flush.
 _RESUME_FREE_FACTOR = 1.02
+
+
+def _fitting(rows: list[Row]) -> int:
+    """How many rows make a chunk, which is lost as a whole if the file is cut there."""
+    total_bytes = 0
+    for count, row in enumerate(rows[:_ROWS_A_CHUNK]):
+        total_bytes += row.picture_bytes
+        if total_bytes > _PICTURE_BYTES_A_CHUNK:
+            return max(count, 1)
+    return _ROWS_A_CHUNK
 
 
 class _Paused(Exception):
@@ -74,9 +87,11 @@ class FileSeries(FileInbox):
         try:
             if self._file is None and time.monotonic() >= self._retry_at:
                 self._begin()
-            if self._file is not None:
+            while self._file is not None:
                 self._fill(self._file, load)
                 self._maintain(self._file)
+                if not (load.rows or load.late):
+                    break
         except _Paused as pause:
             self._pause(f"recording pauses: {pause}")
         except OSError as error:
@@ -92,16 +107,18 @@ class FileSeries(FileInbox):
             self._fail(error)
 
     def _fill(self, file: WrittenFile, load: Load) -> None:
-        """Write a load and empty it as it reaches the disk: what is left is lost if that fails."""
+        """Write some of a load and take it out as it reaches the disk: what is left is lost if that fails."""
+        rows = load.rows[: _fitting(load.rows)]
         events = load.events
         if file.bytes == 0 and self._newest_reference not in events.references:
             events = Events.at_first(self._newest_reference) + events
-        file.writer.write(load.rows, events)
+        file.writer.write(rows, events)
         file.flush()
-        file.cover([row.record.stamp_ns for row in load.rows])
-        self.frames_written += len(load.rows)
-        load.rows, load.events = [], Events()
-        while load.late:
+        file.cover([row.record.stamp_ns for row in rows])
+        self.frames_written += len(rows)
+        del load.rows[: len(rows)]
+        load.events = Events()
+        while load.late and not load.rows:
             file.writer.write_pictures(load.late[:_PICTURES_A_CHUNK])
             file.flush()
             del load.late[:_PICTURES_A_CHUNK]
