@@ -171,7 +171,7 @@ def test_a_damaged_recording_is_replayed_as_far_as_it_is_whole(
     first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
     then, whole = replayed(sequence, tmp_path / "then.jsonl", *first), recording.read_bytes()
     begin = whole.index(b"\x89PNG", len(whole) // 2) + 1000
-    end = whole.index(b"IEND", begin)  # of that image: what lies behind it may be other frames' results
+    end = begin + 2000  # within that image: what lies behind it may be other frames' results
     damaged = whole[:begin] + bytes(end - begin) + whole[end:]
     for name, data in (("cut.rrd", whole[: 2 * len(whole) // 3]), ("damaged.rrd", damaged)):
         (tmp_path / name).write_bytes(data)
