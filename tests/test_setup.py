@@ -540,7 +540,7 @@ def _drawn_where_it_is(config: Config, truth: dict[str, Any], path: Path) -> Non
         pose = None if transform is None else Transform(tuple(transform[:3, 3].tolist()), (x, y, z, w))
         changes = {"verdict": verdict, "cam_T_grip": pose, "corners": (), "jaw_opening_m": truth["jaw_opening_m"]}
         record = frame_record(**changes)
-        outlines = outlines_of(config.camera, config.gripper, record)
+        outlines = outlines_of(config.camera, config.gripper, transform, record.jaw_opening_m)
         jpeg = overlay(np.asarray(image), record, outlines, image.shape[1])
         blue, green, red = np.moveaxis(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int), 2, 0)
         coloured = {"valid": green - red > 60, "suspect": red - blue > 60, "unknown": abs(red - blue) > 60}[

@@ -66,7 +66,7 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
 
     with page(rig.image_path, *rig.options, "--out", tmp_path, "--robot", "arm7") as running:
         visitor = Visitor(driver, running.url)
-        assert "Drag 4 corners" in visitor.text("#status")
+        assert "Drag 3 corners" in visitor.text("#status")
         for width_px in (600, 900, 1400):
             driver.set_window_size(width_px, 900)
             visitor.settle()

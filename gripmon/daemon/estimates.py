@@ -10,6 +10,7 @@ import threading
 from pathlib import Path
 from typing import IO
 
+from gripmon.model.errors import in_short
 from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord, StateRecord, to_json
 
@@ -90,8 +91,9 @@ class EstimatesFile(Output):
                     file.close()
                     file = self._begin()
             file.close()
-        except OSError as error:
-            self._fault = f"{self._path} can't be written: {error.strerror}"
+        except Exception as error:  # noqa: BLE001  said in the state; nothing waits for a thread that has ended
+            reason = error.strerror if isinstance(error, OSError) else in_short(error)
+            self._fault = f"{self._path} can't be written: {reason}"
             _log.error("%s", self._fault)
             with contextlib.suppress(OSError):  # the same fault once more
                 file.close()

@@ -15,6 +15,7 @@ RETRY_S = 1.0
 ANSWER_WITHIN_S = 0.25
 """How long the loop waits for what messages depend on: a frame or a few, once for each new reference.  A disk that
 needs longer is at fault."""
+_SLOW = "state not kept: the disk doesn't answer"
 
 
 class StateKeeper:
@@ -36,7 +37,7 @@ class StateKeeper:
         """Why the state can't be written at present; empty if it can."""
         if self._sink is None:
             return ""
-        return self._sink.failure or ("state not kept: the disk doesn't answer" if self._slow else "")
+        return self._sink.failure or (_SLOW if self._slow else "")
 
     def now(self, state: MonitorState) -> None:
         """Write a state before this returns, if the disk answers within :data:`ANSWER_WITHIN_S`.  A fault is in
@@ -59,7 +60,7 @@ class StateKeeper:
         done = self._wait(self._pass(msgspec.structs.replace(known, references=references, proposal=None), once=True))
         if done or self._sink is None:
             return ""
-        failure = self.failure
+        failure = self.failure or _SLOW  # which may have answered meanwhile
         self._pass(known)  # a slow disk may still get the other one
         return failure
 
@@ -70,8 +71,8 @@ class StateKeeper:
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(CLOSE_WITHIN_S)
-        if self._sink is not None:
-            self._sink.close()
+        if self._sink is not None and not (self._thread is not None and self._thread.is_alive()):
+            self._sink.close()  # else the lock stays with the write that hangs
 
     def _pass(self, state: MonitorState, *, once: bool = False) -> int:
         """Hand a state to the thread; returns its number."""

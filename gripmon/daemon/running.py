@@ -75,7 +75,7 @@ def _closing(
         # All of these run, in reverse order.
         if keeper is not None:
             closing.callback(keeper.close)
-        for output in reversed(parts["outputs"]):
+        for output in parts["outputs"]:  # closed in reverse order: the link last
             closing.callback(output.close)
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(parts["source"].close)

@@ -230,27 +230,34 @@ class StateFile:
             self._lock = None
 
     def _take_lock(self) -> int | None:
-        """A descriptor that holds the lock.  A file of its own, since each write replaces the state's file."""
-        path = self._path.with_name(self._path.name + ".lock")
-        descriptor = None
+        """A descriptor that holds the lock, None, with ``failure`` set, if there can't be one."""
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            descriptor = self._locked()
+        except OSError as error:
+            self._give_up(f"{self._path}.lock can't be locked: {error.strerror or error}")
+            return None
+        _, self._newest_revision = _noted(descriptor)
+        self._note(descriptor)
+        return descriptor
+
+    def _locked(self) -> int:
+        """A descriptor that holds the lock: of a file of its own, since each write replaces the state's file.  Raises
+        OSError, and :class:`StateFileError` if another process holds it.
+        """
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        path = self._path.with_name(self._path.name + ".lock")
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _, self._newest_revision = _noted(descriptor)
-            self._note(descriptor)
         except BlockingIOError:
-            assert descriptor is not None
             holder, _ = _noted(descriptor)
             os.close(descriptor)
             by = "another process" if holder is None else f"process {holder}"
             right = "stop that one, or give this monitor a file of its own"
             raise StateFileError(f"{self._path} is in use by {by}; {right}") from None
-        except OSError as error:
-            if descriptor is not None:
-                os.close(descriptor)
-            self._give_up(f"{path} can't be locked: {error.strerror or error}")
-            return None
+        except OSError:
+            os.close(descriptor)
+            raise
         return descriptor
 
     def _lock_again_if_gone(self) -> None:
@@ -258,11 +265,8 @@ class StateFile:
         held = self._lock
         if held is None or os.fstat(held).st_nlink > 0:
             return
-        newest = self._newest_revision
-        self._lock = self._take_lock()
-        self._newest_revision = newest
-        if self._lock is not None:
-            self._note(self._lock)
+        self._lock = self._locked()  # an OSError is told as one of the write, which is tried again
+        self._note(self._lock)
         os.close(held)
 
     def _note(self, descriptor: int) -> None:

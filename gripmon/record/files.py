@@ -221,16 +221,18 @@ class FileSeries(FileInbox):
         file = self._file
         path = self._directory if file is None else file.path
         try:
-            free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
+            with self._asking_disk():
+                free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
         except OSError as missing:
             free = str(missing.strerror)
         self._pause(f"recording failed: can't write {path} ({free}): {error.strerror or error}")
         self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
         if file is not None:
-            file.close()
+            with contextlib.suppress(OSError):  # the same disk
+                file.close()
             self._leave()
             if file.frames == 0:
-                with contextlib.suppress(OSError):  # the same disk
+                with contextlib.suppress(OSError), self._asking_disk():
                     file.path.unlink(missing_ok=True)
                     pin_path(file.path).unlink(missing_ok=True)
 

@@ -6,6 +6,7 @@ Nothing here may import rerun or OpenCV, which the daemon's process does without
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import sys
@@ -49,9 +50,11 @@ class Worker:
         try:
             with _no_main_module():
                 self._process.start()
-        except OSError:
+        except (OSError, AssertionError) as error:
             self._batches.close()
             self._reports.close()
+            if isinstance(error, AssertionError):  # multiprocessing's, in a worker of its pool
+                raise OSError(errno.EPERM, "a daemonic process may have no children; a Pool's worker is one") from None
             raise
         finally:
             theirs.close()

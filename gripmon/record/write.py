@@ -50,6 +50,7 @@ _BATCH_FRAMES = 16
 _FRAMES_A_TURN = 4  # before the interpreter lock is released
 ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
+_LEFT_AFTER_S = 10.0  # of a process that even a signal doesn't end
 _LOSSES_PERIOD_S = 60.0  # between two log lines about losses
 _EVENTS_KEPT = 4096  # while there is no process
 _FOR_THE_DAEMON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -119,6 +120,8 @@ class ProcessRecorder(Recorder):
     def failure(self) -> str | None:
         worker = self._worker
         sending_from_s = None if worker is None else worker.sending_from_s
+        if worker is None or not worker.heard:  # it is still starting
+            sending_from_s = None
         if sending_from_s is not None and time.monotonic() - sending_from_s > SILENT_AFTER_S:
             return SILENT
         return self._own_failure or self._health.fault or self._status.failure
@@ -130,6 +133,7 @@ class ProcessRecorder(Recorder):
 
     @property
     def process_id(self) -> int | None:
+        """Of the recording process, None while there is none."""
         worker = self._worker
         return None if worker is None else worker.pid
 
@@ -162,7 +166,10 @@ class ProcessRecorder(Recorder):
         self._thread.join(timeout_s)
         if self._thread.is_alive() and (worker := self._worker) is not None and worker.sending_from_s is not None:
             worker.kill()  # it doesn't take what it is sent
-        self._thread.join()
+        self._thread.join(timeout_s + _LEFT_AFTER_S)
+        if self._thread.is_alive():
+            _log.error("recording incomplete: its process hangs in a disk that doesn't answer, and was left there")
+            return
         self._frames.clear()
         handed = self._frames.offered - self._frames.dropped
         self._lost_earlier = handed - self.frames_written - self._left_writing - self._status.frames_lost

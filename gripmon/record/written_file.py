@@ -6,6 +6,7 @@ waits for ever.  Memory doesn't fail: an error of the disk is an :class:`OSError
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import mmap
@@ -62,7 +63,8 @@ class WrittenFile:
         self._asking_disk = asking_disk
         with asking_disk():
             self._disk = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-            fcntl.flock(self._disk, fcntl.LOCK_EX)  # others see that it is being written
+            with contextlib.suppress(OSError):  # some network file systems have no locks
+                fcntl.flock(self._disk, fcntl.LOCK_EX)  # others see that it is being written
         self._memory = os.memfd_create("gripmon-rrd")
         self._stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
         self._stream.set_sinks(rr.FileSink(f"/proc/self/fd/{self._memory}"))
@@ -90,10 +92,15 @@ class WrittenFile:
         self.close()
 
     def close(self) -> None:
-        """Close it as it is."""
+        """Close it as it is; twice does nothing more.  Raises OSError: some disks say only then that they are full."""
+        if self._disk < 0:
+            return
+        disk, memory, self._disk, self._memory = self._disk, self._memory, -1, -1
         self._stream.disconnect()
-        os.close(self._disk)
-        os.close(self._memory)
+        del self._stream, self.writer  # which keep rerun's threads
+        os.close(memory)
+        with self._asking_disk():
+            os.close(disk)
 
     def _copy(self) -> None:
         copied, end = self.bytes, os.fstat(self._memory).st_size

@@ -226,9 +226,9 @@ def steady_ns() -> int:
     Nobody sets it, NTP and PTP don't slew it (``CLOCK_BOOTTIME`` they do, by up to 8 % with chrony), and it goes on
     while the machine is suspended (in which ``CLOCK_MONOTONIC_RAW`` stands still).
     """
-    read = time.clock_gettime_ns
+    read, awake, all_time = time.clock_gettime_ns, time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME
     # Read one after the other, these two differ by too little if the process is interrupted between them.
-    asleep_ns = max(read(time.CLOCK_BOOTTIME) - read(time.CLOCK_MONOTONIC) for _ in range(3))
+    asleep_ns = max(read(all_time) - read(awake), read(all_time) - read(awake), read(all_time) - read(awake))
     return read(time.CLOCK_MONOTONIC_RAW) + asleep_ns
 
 
