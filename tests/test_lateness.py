@@ -52,6 +52,12 @@ def test_a_delay_that_lasts_is_never_forgotten(delay_s: float):
     assert "or more later than they did" in lasting_fault("a/key", lateness.lasting_s)
 
 
+def test_a_delay_that_comes_and_goes_a_little_is_not_forgotten_bit_by_bit():
+    """By 50 ms more in every other minute, which alone could be drift."""
+    said, _ = series(lambda at_s: 0.005 + (2.5 + 0.05 * (at_s // 60 % 2) if at_s >= 20 else 0.0), seconds=7200)
+    assert min(said[200:]) > 2.4
+
+
 def test_it_is_over_when_the_link_is_fast_again():
     said, lateness = series(lambda at_s: 0.005 + (2.5 if 20 <= at_s < 400 else 0.0), seconds=600)
     assert said[4025:] == [0.0] * (6000 - 4025) and lateness.lasting_s == 0.0

@@ -137,6 +137,15 @@ def test_a_clock_that_was_set_costs_one_message_and_time_goes_on_by_the_log(step
     assert all(abs(error_ns) <= 3_000_000 for i, error_ns, _ in found if i != 5), "as far as the log's jitter"
 
 
+def test_messages_that_were_logged_twice_move_no_others():
+    """A relay's copies, a millisecond later by the log: each is refused, and the others are as they were sent."""
+    seconds_ns = [(1000 + k) * 10**9 for k in range(50)]
+    sent = [Stamped(at_ns, at_ns + late_ns) for at_ns in seconds_ns for late_ns in (0, 1_000_000)]
+    told = [(ns, fault) for _, ns, fault in rising(list(enumerate(sent)))]
+    assert [ns for ns, fault in told if fault is None] == seconds_ns
+    assert {fault for _, fault in told[1::2]} == {"its time stamp is that of the message before"}
+
+
 def test_stamps_in_order_stay_as_they_are_however_late_they_are_logged():
     late_ns = [0, 3 * NS, 3 * NS, 1 * NS, 0, 2 * NS]
     sent = [(i, Stamped(BEGIN_NS + i * NS // 10, BEGIN_NS + i * NS // 10 + late)) for i, late in enumerate(late_ns)]

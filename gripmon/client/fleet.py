@@ -181,8 +181,8 @@ class Fleet(Joined):
         *,
         monitor_id: str = "",
     ) -> tuple[CommandReply, bytes | None]:
-        """Send one of them a command, as :meth:`gripmon.client.Client.send` does; returns the reply and its attachment,
-        a snapshot's image.  Raises as that does.
+        """Send one of them a command, as :meth:`gripmon.client.TransformClient.send` does; returns the reply and its
+        attachment, a snapshot's image.  Raises as that does.
         """
         request = CommandRequest(argument, uuid.uuid4().hex, monitor_id)
         return ask(self, Keys(*monitor), request, name, timeout_s)

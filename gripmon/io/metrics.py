@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import msgspec
 from msgspec import Meta
@@ -103,7 +103,9 @@ class MetricsServer(Output):
             key, right = _remedy(error)
             reason = getattr(error, "strerror", None) or error
             raise MetricsError(f"metrics.{key}: can't listen at {where} ({reason}); {right}") from None
-        # A client that hung up would be a traceback on stderr.
+        # A client that sends no request would keep a thread for ever, one that hung up be a traceback on stderr.
+        handler = cast(type, self._server.RequestHandlerClass)
+        self._server.RequestHandlerClass = type("_Handler", (handler,), {"timeout": 10.0})
         self._server.handle_error = lambda *_: None  # type: ignore[method-assign]
 
     def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:

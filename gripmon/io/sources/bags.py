@@ -7,6 +7,7 @@ writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``
 from __future__ import annotations
 
 import base64
+import contextlib
 import functools
 import json
 from collections.abc import Callable, Iterator
@@ -185,11 +186,6 @@ def is_rosbag2(path: str) -> bool:
     return there(joined(path, "metadata.yaml"))
 
 
-def image_topics(types: dict[str, str]) -> list[str]:
-    """Names of the topics with images."""
-    return sorted(topic for topic, name in types.items() if _kind(name) in _IMAGES)
-
-
 class BagSource(Stored):
     """Every image of a topic, in order of log time, with the stamp of its own header (if that is empty, the log's),
     and the opening at that time.  A frame with a wrong stamp has no image, but a fault (:func:`rising`); so has the
@@ -225,8 +221,8 @@ class BagSource(Stored):
         try:
             message = next(self._bag.messages(near or topics), None)
             return None if message is None else lens_of(message.decode(), rectified="rect" in self.topic)
-        except (_CutShort, ValueError) as error:
-            raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {error}") from None
+        except Exception as error:  # noqa: BLE001  each library's own
+            raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {one_line(error)}") from None
 
     def read(self) -> Frame | None:
         return next(self._frames, None) if self._open else None
@@ -252,25 +248,30 @@ class BagSource(Stored):
         """Stamps (n,) and openings (n,) of all reports, in order of time."""
         if opening is None:
             return np.empty(0, np.int64), np.empty(0)
-        reports: list[tuple[float, Stamped]] = []
-        names: set[str] = set()
-        topics = self._topics(_JOINTS)
-        try:
+        reports: dict[str, list[tuple[float, Stamped]]] = {}  # by topic: two may say the same
+        names, topics, refused = set[str](), self._topics(_JOINTS), ""
+        with contextlib.suppress(_CutShort):  # the images end there, too, and report it
             for message in self._bag.messages(topics) if topics else ():
-                found = message.decode()
-                names.update(found.name)
-                opening_m = opening.opening_m(dict(zip(found.name, map(float, found.position), strict=False)))
+                try:
+                    found = message.decode()
+                    names.update(found.name)
+                    opening_m = opening.opening_m(dict(zip(found.name, map(float, found.position), strict=False)))
+                    stamped = Stamped(_stamp_ns(found) or message.log_ns, message.log_ns)
+                except _CutShort:
+                    raise
+                except Exception as error:  # noqa: BLE001  each library's own; one bad message costs itself
+                    refused = refused or one_line(error)
+                    continue
                 if opening_m is not None:
-                    reports.append((opening_m, Stamped(_stamp_ns(found) or message.log_ns, message.log_ns)))
-        except _CutShort:
-            pass  # the images end there, too, and report it
-        except ValueError as error:
-            raise SourceError(f"opening: {self._path}: {error}") from None
+                    reports.setdefault(message.topic, []).append((opening_m, stamped))
+        if refused and not reports:
+            raise SourceError(f"opening: {self._path}: {refused}")
         if not reports:
             there = ", ".join(sorted(names)) or "none"
             wanted = ", ".join(opening.joints)
             raise SourceError(f"opening.joints: {self._path} has no joint state of {wanted}; of its joints: {there}")
-        sound = [(stamp_ns, opening_m) for opening_m, stamp_ns, fault in rising(reports) if fault is None]
+        told = (each for of_topic in reports.values() for each in rising(of_topic))
+        sound = sorted((stamp_ns, opening_m) for opening_m, stamp_ns, fault in told if fault is None)
         return np.array([stamp for stamp, _ in sound], np.int64), np.array([opening for _, opening in sound])
 
     def _read(self) -> Iterator[Frame]:

@@ -149,9 +149,9 @@ def open_dataset(path: str) -> LeRobotDataset:
             with opened(joined(path, "meta/episodes.jsonl")) as file:
                 rows = [msgspec.json.decode(line, type=dict[str, Any]) for line in file if line.strip()]
         episodes = {msgspec.convert(row, _Episode).episode_index: row for row in rows}
-    except (ValueError, TypeError, RecursionError) as error:
-        if isinstance(error, SourceError):
-            raise
+    except SourceError:
+        raise
+    except Exception as error:  # noqa: BLE001  a stranger's files, and each library's own errors
         raise SourceError(f"path: {path} isn't a LeRobot dataset ({one_line(error):.200}); a complete one") from None
     return LeRobotDataset(path, info, description, episodes)
 

@@ -394,8 +394,8 @@ class Lateness:
     def _follow_the_drift(self) -> None:
         """At a window's end."""
         window_ns, self._window_ns = self._window_ns, _FAR_NS
-        if self._before_ns < _FAR_NS and 0 < window_ns - self._before_ns <= 1e9 * MOST_DRIFT * WINDOW_S:
-            self._smallest_ns += window_ns - self._before_ns
+        if self._before_ns < _FAR_NS and abs(window_ns - self._before_ns) <= 1e9 * MOST_DRIFT * WINDOW_S:
+            self._smallest_ns += window_ns - self._before_ns  # both ways: what comes and goes leaves nothing behind
         self._before_ns = window_ns
 
 

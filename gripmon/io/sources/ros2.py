@@ -18,6 +18,7 @@ from gripmon.io.sources.network import Arrival, ArrivingCamera, Content, SilentA
 from gripmon.io.sources.payload import PayloadError, file_image, message_image
 from gripmon.io.wire.link import Malformed
 from gripmon.model.camera import Camera, make_camera
+from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG, PNG
 from gripmon.model.jaw import JointOpening, positions_by_joint
 from gripmon.model.records.values import NS_PER_S
@@ -100,7 +101,7 @@ class Ros2Camera(ArrivingCamera):
 
         self._subscription, self._type = None, ""
         if (topic := self._settings.joint_states) is not None:
-            node.create_subscription(JointState, topic, self._heard_joints, qos_profile_sensor_data)
+            node.create_subscription(JointState, topic, self._heard_joints, qos_profile_sensor_data, raw=True)
         if (topic := self._settings.camera_info) is not None:
             node.create_subscription(CameraInfo, topic, self._heard_info, qos_profile_sensor_data, raw=True)
 
@@ -129,15 +130,19 @@ class Ros2Camera(ArrivingCamera):
                     QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT), raw=True,
                 )  # fmt: skip
 
-    def _heard_joints(self, message: Any) -> None:
+    def _heard_joints(self, payload: bytes) -> None:
+        from rclpy.serialization import deserialize_message
+        from sensor_msgs.msg import JointState
+
         assert self._settings.opening is not None, "checked with the settings"
         try:
+            message = deserialize_message(payload, JointState)
             positions = positions_by_joint(message.name, message.position)
             if (opening_m := self._settings.opening.opening_m(positions)) is not None:
                 self._openings.take(ReportedOpening(_stamp_ns(message), opening_m))
                 self._joints.good()
-        except ValueError as error:
-            self._joints.add(str(error))
+        except Exception as error:  # noqa: BLE001  rclpy's own for what it can't decode
+            self._joints.add(one_line(error))
 
     def _heard_info(self, message: bytes) -> None:
         """Compare the calibration with the configuration's, then with the first one."""
@@ -147,14 +152,15 @@ class Ros2Camera(ArrivingCamera):
         if (now_s := time.monotonic()) < self._next_info_s:
             return
         self._next_info_s = now_s + _INFO_EVERY_S
-        topic, info = self._settings.camera_info, deserialize_message(message, CameraInfo)
+        topic = self._settings.camera_info
         try:
+            info = deserialize_message(message, CameraInfo)
             lens = lens_of(info, rectified="rect" in self.key)
             if not self._info and self._camera is not None and lens is not None:
                 self.compared_px = apart(self._camera, make_camera(lens))
                 _log.info("%s is at most %.2g px from the configuration's camera", topic, self.compared_px)
-        except ValueError as error:
-            self._info_fault = f"{topic}: {error}"
+        except Exception as error:  # noqa: BLE001  rclpy's own for what it can't decode
+            self._info_fault = f"{topic}: {one_line(error)}"
             return
         told = repr((lens, info.roi, info.binning_x, info.binning_y))
         self._info = self._info or told

@@ -46,6 +46,8 @@ def rising(messages: Iterable[tuple[_T, Stamped]]) -> Iterator[tuple[_T, int, st
         message, stamped = waiting.popleft()
         following = [after for _, after in waiting]
         fault = None
+        if last is not None and stamped.stamp_ns == last.stamp_ns:
+            return message, last_ns, "its time stamp is that of the message before"
         if _is_wrong(last, stamped, following):
             fault = f"its time stamp is wrong: {_apart(stamped, last or following[0])} than the log's times say"
             return message, max(last_ns, 0), fault
