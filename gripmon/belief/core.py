@@ -97,7 +97,7 @@ class Belief:
         self._jumps = Jumps.of(self.priors, along)
         self._edges, self._fingers = len(doubts[0].edges), len(doubts[0].ends)
         p = self.priors
-        self._sizes = np.array([p.near_px**2, p.far_px**2, p.missed, p.aligned, p.across_m**2])
+        self._sizes = np.array([p.near_px**2, p.far_px**2, p.missed, p.aligned, p.across_m**2, p.lasting_px**2])
         self._everything, self._searching = everything, searching
         kept = _MOST_CANDIDATES if everything else most + 1
         listed = kept if everything else kept + _MOST_LISTED

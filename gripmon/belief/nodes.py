@@ -233,9 +233,9 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
 def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes: Array) -> None:
     """What a straight thing over the fingers' ends explains that edges apart don't: all of them are found as if the
     fingers were longer or shorter by one length; half of such things lie flush with the fingers, as jaws and tables
-    align them, so that each is found there exactly, of others but for an edge's width.
+    align them, so that each is found there as exactly as the gripper's own, of others but for an edge's width.
     """
-    near, missed, share, across = sizes[0], sizes[2], sizes[3], sizes[4]
+    near, missed, share, across, lasting = sizes[0], sizes[2], sizes[3], sizes[4], sizes[5]
     before = bank.doubts[nodes.parent[i]]
     for k in range(len(table.edges)):
         nodes.across[i, k] = 0.0
@@ -247,15 +247,17 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
         log, cross, along = np.zeros(2), np.zeros(2), np.zeros(2)  # flush, and but for an edge's width
         apart, rows, fresh = 0.0, 0, (before >> k) & 1 == 0
         for edge in range(len(seen.found)):
-            if not ((table.edges[k] >> edge) & 1 and seen.found[edge] > 0):
+            of = max(seen.fitted[edge], 0)
+            way = seen.rows[edge, of, 0, _FIRST] + seen.rows[edge, of, 0, _FIRST + 1]
+            # An edge along the finger isn't that of a thing across: no length of it would take it out of the search.
+            if not ((table.edges[k] >> edge) & 1 and seen.found[edge] > 0 and across * way * way > sizes[1]):
                 continue
             apart += nodes.held[i, edge]
             fresh = fresh or not_drawn(bank, nodes.parent[i], edge)
-            of = max(seen.fitted[edge], 0)
             for row in range(2):
                 way = seen.rows[edge, of, row, _FIRST] + seen.rows[edge, of, row, _FIRST + 1]
                 missing = seen.lines[edge, of, row] - nodes.at[i, edge, row]
-                variance = nodes.wide[i, edge, row] + strength_of(seen, edge, row) + seen.white[edge, of, row]
+                variance = lasting + nodes.wide[i, edge, row] + strength_of(seen, edge, row) + seen.white[edge, of, row]
                 for kind in range(2):
                     log[kind] += normal(missing, variance)
                     cross[kind] += way * missing / variance
@@ -263,7 +265,7 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
                     variance += near
                 rows += 1
         share_now = share if fresh else missed * share
-        if rows == 0 or along[0] == 0.0 or share_now == 0.0:
+        if rows == 0 or share_now == 0.0:
             continue
         for kind in range(2):
             free = 1.0 + across * along[kind]
