@@ -131,9 +131,7 @@ def _ask(arguments: Arguments) -> tuple[CommandReply, bytes | None]:
 
 def _table(state: MonitorState) -> list[str]:
     """References, the newest last, a proposal, and the open alerts, a line each."""
-    # A second camera has none.
-    lines = ["references, the last one in force:"] if state.references else []
-    lines += [f"  {_line(reference)}" for reference in state.references]
+    lines = ["references, the last one in force:", *(f"  {_line(reference)}" for reference in state.references)]
     lines += ["proposed:", f"  {_line(state.proposal)}"] if state.proposal is not None else []
     lines += ["open alerts:"] if state.alerts else []
     for kept in state.alerts:

@@ -50,7 +50,7 @@ OutlinesOf = Callable[[Array | None, float | None], Outlines]
 
 
 def no_outlines(_cam_T_grip: Array | None, _jaw_opening_m: float | None) -> Outlines:
-    """For a camera without a gripper."""
+    """Where nobody draws."""
     return ()
 
 

@@ -226,14 +226,15 @@ class Loop(ABC):
 
     def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
         """Pass something to one receiver, whose failure must not affect others; False if it failed, which is logged."""
-        kind = f"{what} {put.__name__}"  # an output may take frames and no events
         try:
             put(*values, **named)
         except Exception as error:  # noqa: BLE001  logged here, an alert at the end of the frame
+            kind = f"{what} {put.__name__}"  # an output may take frames and no events
             self._faults[kind] = f"{what} fails: {in_short(error)}"
             self._log_once(kind, "", self._faults[kind], error)
             return False
-        self._logged_faults.pop(kind, None)
+        if self._logged_faults:
+            self._logged_faults.pop(f"{what} {put.__name__}", None)
         return True
 
     def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:

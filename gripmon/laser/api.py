@@ -171,7 +171,7 @@ def check_laser(
     settings: SpotWatchSettings | None = None,
     progress: Progress = quiet,
 ) -> LaserCheck:
-    """Judge new spots one after the other, as the second camera's monitor does."""
+    """Judge new spots one after the other."""
     samples = samples if isinstance(samples, Samples) else read_samples(samples)
     watch = SpotWatch(calibration, settings or SpotWatchSettings())
     found = spots_of(samples, (calibration.camera.width_px, calibration.camera.height_px), progress)

@@ -148,9 +148,6 @@ def load_config(
     """
     path = Path(path)
     values = read_configuration(path)
-    if "laser" in values and "gripper" not in values:
-        right = "gripmon check --laser LASER.yaml SPOTS.csv compares fresh spots with a calibration"
-        raise ConfigError(path, "laser", "a second camera isn't watched by the daemon any more", right)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
     camera = _camera(path, settings, calibrated)

@@ -26,6 +26,13 @@ class _Gone(NamedTuple):
 
 _GONE = (
     _Gone(
+        (),
+        "laser",
+        "a second camera isn't watched by the daemon any more",
+        lambda _: True,
+        "gripmon check --laser LASER.yaml SPOTS.csv compares fresh spots with a calibration",
+    ),
+    _Gone(
         ("source",),
         "topic",
         "is gone: ROS 2 is spoken by rclpy now",

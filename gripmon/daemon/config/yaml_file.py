@@ -80,9 +80,7 @@ def builtin_config(name: str) -> Path:
 
 
 def read_configuration(path: Path) -> dict[str, Any]:
-    """The mapping in a configuration.  :class:`ConfigError`, which names the type
-    of any other gripmon file.
-    """
+    """The mapping in a configuration.  :class:`ConfigError`, which names the type of any other gripmon file."""
     inside = path / "config.yaml"  # as gripmon teach and setup name it
     if inside.is_file():
         raise ConfigError(path, "", "is a folder", f"the configuration in it, {inside}")

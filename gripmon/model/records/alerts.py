@@ -99,8 +99,8 @@ class Alert(msgspec.Struct, frozen=True):
         tuple[float, float, float] | None,
         Meta(
             description="of the TCP against the reference, less the reference's error as the first frames showed it, "
-            "along the camera's x, y, z, m; of a second camera: by how much it now puts a spot elsewhere; null: not "
-            "about a motion"
+            "along the camera's x, y, z, m; of a laser calibration: by how much a spot is elsewhere; null: not about a "
+            "motion"
         ),
     ] = None
     rotation_rad: Annotated[float | None, Meta(description="turn against the reference, rad; null likewise")] = None

@@ -29,9 +29,7 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     robot: Annotated[str, Meta(description="second part of the monitor's keys")]
     camera: Annotated[str, Meta(description="third part of the monitor's keys")]
     state: State
-    verdict: Annotated[
-        Verdict, Meta(description="of the last transform, of a second camera's calibration; unknown without frames")
-    ]
+    verdict: Annotated[Verdict, Meta(description="of the last transform; unknown without frames")]
     stamp_ns: Annotated[int, Meta(description="when it was said, Unix ns")]
     seq: Annotated[int, Meta(description="the last frame's; -1 before the first")]
     reference_id: Annotated[str, Meta(description="the reference in force")]
@@ -47,32 +45,24 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     version: Annotated[str, Meta(description="of gripmon")]
     tcp_shift_m: Annotated[
         tuple[float, float, float] | None,
-        Meta(
-            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; "
-            "of a second camera: of the place on its plane that its axis meets, null unless it has moved itself"
-        ),
+        Meta(description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown"),
     ] = None
     sigma_m: Annotated[
         float | None,
-        Meta(
-            description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown; of a "
-            "second camera: of tcp_shift_m, null with it"
-        ),
+        Meta(description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown"),
     ] = None
     protection_m: Annotated[
         float | None,
-        Meta(description="bound on the TCP's position error, of the last transform, m; null: unknown, second cameras"),
+        Meta(description="bound on the TCP's position error, of the last transform, m; null: unknown"),
     ] = None
     alert_limit_m: Annotated[
         float | None,
-        Meta(
-            description="position error of the TCP that the task tolerates, as configured, m; null for second cameras"
-        ),
+        Meta(description="position error of the TCP that the task tolerates, as configured, m; null: unknown"),
     ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
     transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
     malformed: Annotated[
-        int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")
+        int, Meta(description="messages received that were none: jaw openings, frames, commands")
     ] = 0
     recording_images_dropped: Annotated[
         int, Meta(description="images that should be in the recording and aren't, of frames that are")
@@ -83,7 +73,7 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     ] = ""
     valid_by: Annotated[
         ValidBy | None,
-        Meta(description="which error protection_m bounds, as in transform; null for second cameras, earlier monitors"),
+        Meta(description="which error protection_m bounds, as in transform; null for earlier monitors"),
     ] = None
 
 
