@@ -248,20 +248,38 @@ def things_seen(bank: Bank, h: int, edge: int, kind: int) -> int:
 
 
 @compiled
-def stayed(
-    bank: Bank, h: int, seen: Seen, edge: int, row: int, slot: int, stays: float, size: float, place: Array,
+def row_of_thing(
+    bank: Bank, h: int, seen: Seen, edge: int, of: int, row: int, slot: int, stays: float, size: float, place: Array,
     spread: Array,
-) -> None:  # fmt: skip
-    """Where one row of a remembered thing is now: ``place`` (2,) with ``spread`` (3,).  Of those but the last one seen
-    the background counts as new.
+) -> float:  # fmt: skip
+    """Log likelihood of one row of line ``of`` as a remembered thing's, whose ``place`` (2,) learns from it, with its
+    ``spread`` (3,), as in :func:`drawn`.  Of those but the last one seen the background counts as new.
     """
-    like = 0.0 if slot >= FOREIGN_KINDS else seen.likeness[edge] if seen.found[edge] > 0 else 1.0
+    shown = seen.found[edge] > 0
+    like = 0.0 if slot >= FOREIGN_KINDS else seen.likeness[edge] if shown else 1.0
     was = bank.place_spread[h, edge, slot, row]
     place[0] = stays * bank.place[h, edge, slot, row, 0]
     place[1] = like * bank.place[h, edge, slot, row, 1]
     spread[0] = stays * stays * was[0] + (1.0 - stays * stays) * size
     spread[1] = stays * like * was[1]
     spread[2] = like * like * was[2] + (1.0 - like * like) * strength_of(seen, edge, row)
+    if not shown:
+        return 0.0
+    missing = seen.image[edge, of, row] - bank.searched[h, edge, slot, row]
+    return drawn(place, spread, missing, seen.image_white[edge, of, row], seen.white[edge, of, row])
+
+
+@compiled
+def row_of_new_thing(
+    seen: Seen, edge: int, of: int, row: int, at: float, variance: float, place: Array, spread: Array
+) -> float:
+    """The same as that of a thing that wasn't seen before and lies ``at`` px, with a ``variance``, from where the edge
+    was searched.
+    """
+    white = seen.white[edge, of, row]
+    place[0], place[1] = at, 0.0
+    spread[0], spread[1], spread[2] = variance, 0.0, strength_of(seen, edge, row)
+    return drawn(place, spread, seen.lines[edge, of, row] - seen.searched[edge, of, row], white, white)
 
 
 @compiled
@@ -337,22 +355,15 @@ def foreign(
             for of in range(max(count, 1)):
                 log = share
                 for row in range(2):
-                    missing, white, own = 0.0, seen.white[edge, of, row], seen.white[edge, of, row]
                     if way < known:
                         slot = FOREIGN_KINDS * way + kind
-                        white = seen.image_white[edge, of, row]
-                        if count > 0:
-                            missing = seen.image[edge, of, row] - bank.searched[h, edge, slot, row]
-                        stayed(bank, h, seen, edge, row, slot, stays, sizes[kind], place[row], spread[row])
-                    else:
-                        missing = seen.lines[edge, of, row] - seen.searched[edge, of, row]
-                        place[row, 0], place[row, 1] = 0.0, 0.0
-                        spread[row, 0], spread[row, 1], spread[row, 2] = sizes[kind], 0.0, strength_of(seen, edge, row)
-                        if kind == NEAR:
-                            place[row, 0] = at[row] - seen.searched[edge, of, row]
-                            spread[row, 0] += wide[row]
-                    if count > 0:
-                        log += drawn(place[row], spread[row], missing, white, own)
+                        log += row_of_thing(
+                            bank, h, seen, edge, of, row, slot, stays, sizes[kind], place[row], spread[row]
+                        )
+                    elif count > 0:
+                        near_px = at[row] - seen.searched[edge, of, row] if kind == NEAR else 0.0
+                        variance = sizes[kind] + (wide[row] if kind == NEAR else 0.0)
+                        log += row_of_new_thing(seen, edge, of, row, near_px, variance, place[row], spread[row])
                 total = log if total == -math.inf else log_sum(total, log)
                 if log > most:
                     most, best_way, best_line = log, way, of
