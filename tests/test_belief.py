@@ -59,7 +59,7 @@ def frames_of(
         zeros, white = np.zeros(edges, np.int64), np.full((edges, 1, 2), 4e-4)
         seen = Seen(
             rows[:, None], y[:, None], white, (rows @ g)[:, None], y[:, None], white, zeros + 1, zeros, zeros.copy(),
-            rho, np.full(edges, 1e-2), rows @ g,
+            rho, np.full(edges, 1e-2),
         )  # fmt: skip
         answer = rng.integers(0, 3, 2)
         repeats = (
@@ -73,7 +73,12 @@ def frames_of(
 
 
 def told(frame: Frame) -> Told:
-    return Told(np.log(frame.right), np.log(frame.wrong), frame.repeats, frame.memory, np.log(frame.together))
+    """Looked at in one place, where everything is."""
+    nowhere = np.zeros((len(frame.seen.found), SIZE))
+    return Told(
+        np.log(frame.right)[None], np.log(frame.wrong)[None], np.array([frame.memory]), 1.0 * frame.repeats[None],
+        np.log(frame.together)[None], np.array([1.0 * frame.repeats.all()]), nowhere, np.zeros((1, SIZE)), 0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("seed", "count", "leaving"), [(1, 5, True), (2, 5, True), (3, 15, False)])
@@ -334,7 +339,7 @@ def test_what_lies_flush_over_the_ends_is_no_slide() -> None:
     for t, frame in enumerate(frames):
         seen = frame.seen._replace(rows=frames[0].seen.rows)
         seen.lines[:] = np.random.default_rng(t).normal(0.0, 0.05, seen.lines.shape)
-        seen.searched[:] = seen.asked[:, None] * 0.0
+        seen.searched[:] = 0.0
         if t == len(frames) - 1:
             seen.lines[:4, 0] += 4e-3 * np.array([5000.0, 300.0])
             seen.searched[:4, 0] = seen.lines[:4, 0]
@@ -466,7 +471,7 @@ def test_a_mount_that_is_put_aside_and_back_is_followed_each_time() -> None:
         lines = at + lasting + rng.normal(0.0, 0.1, (edges, 2))
         seen = Seen(
             view.rows[:, None], lines[:, None], white, at[:, None], lines[:, None], white, zeros + 1, zeros, zeros,
-            np.zeros(edges), np.full(edges, 1e-2), at,
+            np.zeros(edges), np.full(edges, 1e-2),
         )  # fmt: skip
         believed = belief.update(seen, DT_S)
         off = believed.motion - motion
@@ -551,11 +556,13 @@ def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
 
 
 def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:
+    """Against what they say where all of them are something else's."""
     table = Table.of(of_ends([np.array([True, False]), np.array([False, True])]))
-    told = Told(np.log([0.5, 0.4]), np.log([0.1, 0.2]), np.zeros(2, bool), 0.95, np.full(2, np.nan))
-    here = log_told(0, 0, table, told, True, np.zeros(2, bool))
-    elsewhere = log_told(0, 0, table, told, True, np.array([True, False]))
-    assert np.exp([here, elsewhere]) == pytest.approx([0.5 * 0.4, 0.1 * 0.4])
+    right, wrong, never = np.array([[0.5, 0.4], [0.3, 0.2]]), np.array([[0.1, 0.2], [0.6, 0.7]]), np.full((2, 2), np.nan)
+    zeros = np.zeros((2, SIZE))
+    told = Told(np.log(right), np.log(wrong), np.zeros(2), np.zeros((2, 2)), never, np.zeros(2), zeros, zeros, 0)
+    for looked, expected in (((0, 0), 10.0), ((-1, 0), 2.0), ((0, 1), 10.0 / 7.0), ((-1, -1), 1.0)):
+        assert np.exp(log_told(0, 0, table, told, True, np.array(looked))) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("fault", "within"), [(None, 0.9), ("knock", 0.7), ("opening", 0.8)])

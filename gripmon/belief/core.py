@@ -17,7 +17,7 @@ from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
 from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
-from gripmon.belief.nodes import Nodes, lie_across, look_elsewhere, prepare
+from gripmon.belief.nodes import Nodes, lie_across, look, prepare
 from gripmon.belief.rows import add_noise, fade, move
 from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search, take_one_of
 from gripmon.belief.state import (
@@ -157,7 +157,7 @@ class Belief:
             self._predict(dt_s, max(light_memory, LEAST_LIGHT_MEMORY), opening_m)
         for h in range(self._hypotheses):
             fade(self._bank, h, seen)
-        told = told or nothing_told(self._fingers)
+        told = told or nothing_told(self._edges, self._fingers)
         asked = Asked(seen, self._table, self._onsets.of(seen, dt_s), told, first, self.priors.near_px**2)
         n = self._branch(asked, dt_s)
         surprise = float(self._candidates.surprise[int(np.argmax(self._candidates.log_weight[:n]))])
@@ -186,7 +186,7 @@ class Belief:
             factors.append(rows[rows.any(axis=1)])
         for h in range(self._hypotheses):
             move(self._bank, h, lag, light)
-            factor = factors[int(bool(self._bank.doubts[h] & self._table.moves))]
+            factor = factors[int(self._is_loose(h))]
             if factor.any():
                 add_noise(self._bank, h, self._bank.mean[h], self._bank.covariance[h], factor)
 
@@ -194,9 +194,10 @@ class Belief:
         """Candidates of a frame; their number."""
         bank, nodes, candidates = self._bank, self._nodes, self._candidates
         nothing = np.zeros((0, SIZE))
-        n = 0
+        n, shakes = 0, -self.priors.shakes_per_s * dt_s
         for h in range(self._hypotheses):
-            self._node(h, h, -1, float(bank.log_weight[h]), nothing, asked)
+            stays = 0.0 if self._everything else shakes * self._is_loose(h)
+            self._node(h, h, -1, float(bank.log_weight[h]) + stays, nothing, asked)
             if not self._everything:
                 n = put(candidates, n, nodes, h, int(bank.doubts[h]), bank, asked)
         if self._everything:
@@ -256,7 +257,8 @@ class Belief:
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
             for j in range(len(jumps.share)):
-                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-jumps.per_s[j] * dt_s))
+                per_s = self.priors.shakes_per_s if j == 0 and self._is_loose(h) else jumps.per_s[j]
+                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-per_s * dt_s))
                 if chance <= 0.0:
                     continue
                 log = math.log(chance)
@@ -268,13 +270,16 @@ class Belief:
                 i += 1
         return n
 
+    def _is_loose(self, h: int) -> bool:
+        return bool(self._bank.doubts[h] & self._table.moves)
+
     def _node(self, i: int, h: int, jump: int, before: float, factor: Array, asked: Asked) -> None:
         nodes = self._nodes
         nodes.parent[i], nodes.jump[i], nodes.before[i] = h, jump, before
         doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
         prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
         lie_across(nodes, i, self._bank, asked.seen, self._table, self._sizes)
-        look_elsewhere(nodes, i, asked.seen, self._table)
+        look(nodes, i, self._bank, asked.told, self._table)
 
     def _keep(self, n: int, asked: Asked) -> float:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates

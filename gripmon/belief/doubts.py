@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.belief.state import Flags, Ints, Seen
+from gripmon.belief.state import SIZE, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -157,22 +157,30 @@ class Onsets:
 
 
 class Told(NamedTuple):
-    """What the fingers' ends show: log likelihood of each finger's answer where its ends are ``right`` and ``wrong``
-    (f,); ``repeats`` (f,): whether it is the answer of the frame before; ``memory``: probability that an answer is only
-    repeated.  ``together`` (2,): the same of all fingers' answers where all are right, and all wrong, NaN where these
-    are independent: what lies over all ends answers for all.
+    """What the fingers' ends show at each of the k places where they were looked at: log likelihood of each finger's
+    answer where its ends are there, ``right`` (k, f), and where something else is, ``wrong`` (k, f); ``memory`` (k,):
+    probability that an answer is only one of those before again, ``repeats`` (k, f), the share of these that are the
+    same.  ``together`` (k, 2): log likelihood of all fingers' answers where all are right, and all wrong, NaN where
+    these are independent: what lies over all ends answers for all; ``repeats_together`` (k,), their share.  ``rows``
+    (e, 23): px by which the middle of each edge at an end moves with g; ``at`` (k, 23): g where it was looked; ``fit``:
+    at which of these places the image was fitted.
     """
 
     right: Array
     wrong: Array
-    repeats: Flags
-    memory: float
+    memory: Array
+    repeats: Array
     together: Array
+    repeats_together: Array
+    rows: Array
+    at: Array
+    fit: int
 
 
-def nothing_told(fingers: int) -> Told:
+def nothing_told(edges: int, fingers: int) -> Told:
     """No witness."""
-    return Told(np.zeros(fingers), np.zeros(fingers), np.zeros(fingers, bool), 0.0, np.full(2, np.nan))
+    none, rows, at = np.zeros((0, fingers)), np.zeros((edges, SIZE)), np.zeros((0, SIZE))
+    return Told(none, none, np.zeros(0), none, np.zeros((0, 2)), np.zeros(0), rows, at, 0)
 
 
 @compiled
@@ -197,32 +205,38 @@ def log_transition(before: int, after: int, chances: Chances) -> float:
 
 
 @compiled
-def log_told(before: int, after: int, table: Table, told: Told, first: bool, away: Flags) -> float:
-    """Log likelihood of the witnesses.  An answer that repeats is little news while what it is about stays.  Of fingers
-    whose ends are ``away`` (f,) from where they were looked at, something else was.
+def log_told(before: int, after: int, table: Table, told: Told, first: bool, looked: Ints) -> float:
+    """Log likelihood of the witnesses, over what it is where all ends are something else's and were so before.  An
+    answer heard before is little news while what it is about stays.  ``looked`` (f,): at which place each finger's ends
+    were looked at, -1 for none; at the others something else was.
     """
     total, fingers = 0.0, len(table.ends)
-    rights, sames, repeats = 0, 0, 0
-    for f in range(fingers):
-        bad, was = after & table.ends[f], before & table.ends[f]
-        right, was_right = bad == 0 or bad & table.fooled != 0, was == 0 or was & table.fooled != 0
-        right, was_right = right and not away[f], was_right and not away[f]
-        same = not first and (bad != 0) == (was != 0) and right == was_right
-        rights, sames, repeats = rights + int(right), sames + int(same), repeats + int(told.repeats[f])
-        total += answered(told.right[f] if right else told.wrong[f], same, told.repeats[f], told.memory)
-    alike = rights in (0, fingers) and sames in (0, fingers)
-    if alike and not math.isnan(told.together[0]):
-        log = told.together[0] if rights else told.together[1]
-        total = answered(log, sames > 0, repeats == fingers, told.memory)
+    for k in range(len(told.memory)):
+        apart, wrong, rights, sames = 0.0, 0.0, 0, 0
+        for f in range(fingers):
+            here, bad, was = looked[f] == k, after & table.ends[f], before & table.ends[f]
+            right, was_right = bad == 0 or bad & table.fooled != 0, was == 0 or was & table.fooled != 0
+            same = not first and (not here or ((bad != 0) == (was != 0) and right == was_right))
+            right = right and here
+            rights, sames = rights + int(right), sames + int(same)
+            log = told.right[k, f] if right else told.wrong[k, f]
+            apart += answered(log, same, told.repeats[k, f], told.memory[k])
+            wrong += answered(told.wrong[k, f], not first, told.repeats[k, f], told.memory[k])
+        if not math.isnan(told.together[k, 0]):
+            wrong = answered(told.together[k, 1], not first, told.repeats_together[k], told.memory[k])
+            if rights in (0, fingers) and sames in (0, fingers):
+                log = told.together[k, 0] if rights else told.together[k, 1]
+                apart = answered(log, sames > 0, told.repeats_together[k], told.memory[k])
+        total += apart - wrong
     return total
 
 
 @compiled
-def answered(log: float, same: bool, repeats: bool, memory: float) -> float:
+def answered(log: float, same: bool, repeats: float, memory: float) -> float:
     """Log likelihood of an answer of log likelihood ``log`` if it were new, where what it is about may be the ``same``
-    as before.
+    as before: then answers come from the scene's own (a Dirichlet process about the table).
     """
-    return math.log((memory if repeats else 0.0) + (1.0 - memory) * math.exp(log)) if same else log
+    return math.log(memory * repeats + (1.0 - memory) * math.exp(log)) if same else log
 
 
 def bits(flags: Sequence[bool] | Flags) -> int:

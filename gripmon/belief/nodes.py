@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.belief.doubts import Table
+from gripmon.belief.doubts import Table, Told
 from gripmon.belief.rows import (
     backward,
     foreign,
@@ -49,8 +49,8 @@ class Nodes(NamedTuple):
     that are ``joint`` (n, e), another thing that lies near is wherever the gripper is by the others: these have ``far``
     (n, e) instead.  ``across`` (n, d), by how much that of each doubt's edges together is larger since a straight thing
     may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown; ``hope`` (n,),
-    by how much more a place would explain where all edges were on lines, of those that are on none; ``away`` (n, f):
-    a finger's ends are elsewhere than they were looked at.
+    by how much more a place would explain where all edges were on lines, of those that are on none; ``looked`` (n, f):
+    at which place a finger's ends were looked at, -1 for none.
     """
 
     parent: Ints
@@ -72,7 +72,7 @@ class Nodes(NamedTuple):
     information: Array
     pull: Array
     hope: Array
-    away: Flags
+    looked: Ints
 
     @classmethod
     def empty(cls, nodes: int, edges: int, doubts: int, fingers: int) -> Nodes:
@@ -83,7 +83,7 @@ class Nodes(NamedTuple):
             np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e), np.int64),
             np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
             np.zeros((n, e), bool), np.zeros((n, e)), np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)),
-            np.zeros((n, SIZE)), np.zeros(n), np.zeros((n, fingers), bool),
+            np.zeros((n, SIZE)), np.zeros(n), np.zeros((n, fingers), np.int64),
         )  # fmt: skip
 
 
@@ -275,18 +275,38 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
 
 
 @compiled
-def look_elsewhere(nodes: Nodes, i: int, seen: Seen, table: Table) -> None:
-    """Whether the witnesses looked at this node's ends: within the width of what an end's probes cover."""
+def look(nodes: Nodes, i: int, bank: Bank, told: Told, table: Table) -> None:
+    """Where the witnesses looked at this node's ends: at the nearest place, if that is within what an end's probes
+    cover, or where the fit is, if the node doesn't know its place so well.
+    """
+    mean = bank.mean[nodes.parent[i]]
     for finger in range(len(table.ends)):
-        nodes.away[i, finger] = False
+        ends, wide, least = 0, 0.0, LOOKED_PX
         for k in range(len(table.edges)):
-            if (table.ends[finger] >> k) & 1 == 0 or (table.all_ends >> k) & 1:
-                continue
-            for edge in range(len(seen.found)):
-                if (table.edges[k] >> edge) & 1 and seen.found[edge] > 0:
-                    off = nodes.at[i, edge, 0] - seen.asked[edge, 0]
-                    if abs(off) > LOOKED_PX:
-                        nodes.away[i, finger] = True
+            if (table.ends[finger] >> k) & 1 and not (table.all_ends >> k) & 1:
+                ends |= table.edges[k]
+        nodes.looked[i, finger] = -1
+        for place in range(len(told.at)):
+            most = 0.0
+            for edge in range(len(told.rows)):
+                if not (ends >> edge) & 1:
+                    continue
+                away = 0.0
+                for j in range(SIZE):
+                    away += told.rows[edge, j] * (mean[j] - told.at[place, j])
+                most = max(most, abs(away))
+            if most <= least:
+                nodes.looked[i, finger], least = place, most
+        for edge in range(len(told.rows)):
+            square = 0.0
+            for j in range(SIZE if (ends >> edge) & 1 else 0):
+                along = 0.0
+                for k in range(j, SIZE):
+                    along += nodes.root[i, k, j] * told.rows[edge, k]
+                square += along * along
+            wide = max(wide, square)
+        if wide > LOOKED_PX**2 and len(told.at):
+            nodes.looked[i, finger] = told.fit
 
 
 @compiled

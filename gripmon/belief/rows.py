@@ -9,7 +9,19 @@ import math
 
 import numpy as np
 
-from gripmon.belief.state import FAR, FOREIGN_KINDS, LIGHT, MEMORIES, NEAR, SIZE, STILL, Bank, Seen
+from gripmon.belief.state import (
+    FAR,
+    FOREIGN_KINDS,
+    LIGHT,
+    LINES_APART_PX,
+    MEMORIES,
+    MOST_LINES,
+    NEAR,
+    SIZE,
+    STILL,
+    Bank,
+    Seen,
+)
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -297,6 +309,20 @@ def reached(bank: Bank, h: int, seen: Seen, edge: int, kind: int, known: int, st
 
 
 @compiled
+def is_missed(bank: Bank, h: int, seen: Seen, edge: int, kind: int, stays: float, reach: float) -> bool:
+    """Whether the thing that was seen last isn't among the lines found, where the search would have found it."""
+    at = bank.searched[h, edge, kind, 0] + stays * bank.place[h, edge, kind, 0, 0]
+    spread, looked = bank.place_spread[h, edge, kind, 0], False
+    wide = LINES_APART_PX**2 + 9.0 * (spread[0] + 2.0 * spread[1] + spread[2])
+    for of in range(seen.found[edge]):
+        centre = seen.image[edge, of, 0] - seen.lines[edge, of, 0] + seen.searched[edge, of, 0]
+        looked = looked or (centre - at) ** 2 <= reach
+        if (seen.image[edge, of, 0] - at) ** 2 <= wide:
+            return False
+    return looked and seen.found[edge] < MOST_LINES
+
+
+@compiled
 def remember(
     bank: Bank, h: int, seen: Seen, edge: int, kind: int, way: int, of: int, place: Array, spread: Array
 ) -> None:  # fmt: skip
@@ -329,7 +355,8 @@ def foreign(
     It lies near where the gripper's own is expected, ``at`` (2,) with variance ``wide`` (2,), or anywhere around where
     it was searched, is any of the lines there, and stays there while the picture does; ``held`` moves with the gripper
     and stays in any case.  Where another place was searched another line is found: several are remembered, and half of
-    the frames show the last one.  ``fresh``: the doubt begins; of one that begins while nothing is shown the place is
+    the frames show the last one; another one without that, where both would be found, misses it.  ``fresh``: the doubt
+    begins; of one that begins while nothing is shown the place is
     drawn when something is.  ``near``: it may be near.  ``keep``: it is learnt, and what wasn't shown fades.
     """
     count = seen.found[edge]
@@ -349,8 +376,9 @@ def foreign(
         another = 1.0 if fresh else sizes[2] if count > 0 else 0.0
         if another > 0.0 and not reached(bank, h, seen, edge, kind, known, stays, sizes[FAR]):
             another = 1.0
+        missed = sizes[2] if known > 1 and is_missed(bank, h, seen, edge, kind, stays, sizes[FAR]) else 1.0
         for way in range(known + 1):  # a thing that was seen, the last one first, or one that wasn't
-            part = 1.0 if known == 1 else 0.5 if way == 0 else 0.5 / max(known - 1, 1)
+            part = 1.0 if known == 1 else 0.5 if way == 0 else 0.5 * missed / max(known - 1, 1)
             share = math.log(max(another if way == known else (1.0 - another) * part, 1e-300)) - math.log(max(count, 1))
             for of in range(max(count, 1)):
                 log = share

@@ -76,7 +76,7 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
     log, surprise = weigh(nodes, i, asked.seen, doubted, held, asked.near, root, solution)
     log += nodes.before[i] + log_transition(before, doubts, asked.chances) + across(nodes, i, doubts)
     candidates.node[n], candidates.doubts[n] = i, doubts
-    candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first, nodes.away[i])
+    candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first, nodes.looked[i])
     candidates.surprise[n], candidates.expanded[n] = surprise, False
     return n + 1
 
@@ -140,7 +140,7 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
             gain = without(nodes, i, edge, root, solution, own) - nodes.free[i, edge]
             weight = log - gain if own else log + gain
             weight += nodes.before[i] + log_transition(before, changed, asked.chances)
-            weight += log_told(before, changed, table, asked.told, asked.first, nodes.away[i])
+            weight += log_told(before, changed, table, asked.told, asked.first, nodes.looked[i])
             if weight < floor:
                 continue
         m = put(candidates, n, nodes, i, changed, bank, asked)

@@ -41,6 +41,10 @@ NEAR, FAR = 0, 1
 FOREIGN_KINDS = 2
 MEMORIES = 4
 """Things remembered of a doubted edge: as many places are searched, the fit's and the three heaviest."""
+MOST_LINES = 3
+"""Lines of an edge that one look at it finds, at most."""
+LINES_APART_PX = 1.2
+"""Distance from which two lines are two: twice three standard deviations of an edgel hypothesis."""
 STILL = 0.99
 """Likeness of two pictures from which on the background counts as the same one."""
 LATELY_S = 0.19
@@ -63,10 +67,12 @@ class Priors:
     these along the fingers (half of the search's reach); ``missed``: probability that an edge, of the gripper or of
     another thing, isn't among the lines that were found there (the same for both: else a picture that stays tells more
     with every frame).  ``creep_m_s`` and ``creep_rad_s``: wandering of a mount in a second's square root.
-    ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; in a second's square root while it is
-    loose.  ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three Gaussians
-    (``any_way``: standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its probability
-    since an end was seen last, in each set of doubts (policy: what hides them is what knocks).  ``opening_first``,
+    ``small_per_s``: how often it moves by ``small_m``, ``small_rad`` an axis; while it is loose as far in a second's
+    square root, and besides, shaking, ``shakes_per_s`` as often (brackets shake at some ten Hz: a part of the frames
+    shows them elsewhere).  ``knock_per_s``: one knock a month, of log-normal size, median 3 mm, 1 to 10 mm, as three
+    Gaussians (``any_way``: standard deviation and share) in 2 of 3, else along the fingers.  ``unseen_knock``: its
+    probability since an end was seen last, in each set of doubts (policy: what hides them is what knocks).
+    ``opening_first``,
     ``opening_per_s``: the reported opening is wrong by ``opening_jump_m``, at first and later.
     """
 
@@ -86,6 +92,7 @@ class Priors:
     small_per_s: float = 0.02
     small_m: float = 0.3e-3
     small_rad: float = 3e-3
+    shakes_per_s: float = 10.0
     knock_per_s: float = 4e-7
     unseen_knock: float = 1e-3
     any_way: tuple[tuple[float, float], ...] = ((1.3e-3, 0.40), (2.6e-3, 0.45), (5.5e-3, 0.15))
@@ -142,8 +149,7 @@ class Seen(NamedTuple):
     edge was looked for, px, and ``image`` (e, l, 2), both numbers in a frame of the edge's own that is fixed in the
     image, whatever place the rows are for, with ``image_white``; ``fitted`` (e,): which of them agrees with the fit, -1
     for none.  ``background`` (e,), the remembered one that is behind the edge now; ``likeness`` (e,) of it to when it
-    was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2; ``asked`` (e, 2), px,
-    where it was looked whether ends are ends.
+    was last seen, 0 for a new one; ``strength`` (e,), the variance of a background's error, px^2.
     """
 
     rows: Array
@@ -157,7 +163,6 @@ class Seen(NamedTuple):
     background: Ints
     likeness: Array
     strength: Array
-    asked: Array
 
     @property
     def shown(self) -> Flags:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.belief.state import LIGHT, MOTION, OPENING, Flags, Ints
+from gripmon.belief.state import LIGHT, LINES_APART_PX, MOST_LINES, MOTION, OPENING, Flags, Ints
 from gripmon.model.records import Array
 from gripmon.track.edges import Measurement
 
@@ -17,8 +17,7 @@ FEWEST_POINTS = 6
 """Points of an edge from which it has an offset and a slope with a scatter."""
 LEAST_WHITE_PX = 0.02
 """Standard deviation of an edge that no pixel noise explains: interpolation between pixels."""
-MOST_LINES = 3
-WITHIN_PX = 0.6
+WITHIN_PX = 0.5 * LINES_APART_PX
 """Distance from a line within which an edgel hypothesis is on it: three standard deviations of the least sure ones."""
 PLACES_PX = np.array([(offset, slope) for offset in np.arange(-7.0, 7.01, 0.3) for slope in np.arange(-2.0, 2.01, 0.5)])
 """Where lines are looked for (offset, slope): as far as search lines reach."""
@@ -131,7 +130,7 @@ def lines_of(offset_px: Array, sample: Ints, fraction: Array, agree: Flags, sear
     def take(on: Flags) -> None:
         nonlocal left
         place = np.linalg.lstsq(basis[on], offset_px[on], rcond=None)[0]
-        left = left & (np.abs(offset_px - basis @ place) > 2.0 * WITHIN_PX)
+        left = left & (np.abs(offset_px - basis @ place) > LINES_APART_PX)
         out.append(on)
 
     if len(np.unique(sample[agree])) >= FEWEST_POINTS:

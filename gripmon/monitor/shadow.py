@@ -20,9 +20,10 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor.edge_lines import Frame2d, found_at, merged
+from gripmon.monitor.ends_told import EndsTold
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, edges_at_ends, inner_edges, sides
 from gripmon.track.edges.profiles import read_profiles
 
 MOST_PLACES = 3
@@ -45,17 +46,6 @@ STILL_NOISES = 1.5
 LIKE_STILL, MOST_LIKE = 0.999, 0.98
 ANOTHER = 0.5
 """Likeness under which a background is another one; different stills reach it in a tenth of the pairs, at most."""
-RIGHT, WRONG = np.array([0.155, 0.276, 0.569]), np.array([0.812, 0.117, 0.071])
-"""How probable 0, 1 or 2 indications of a finger's end are where it is one and where it is something else, of one of
-several fingers in view.  These tables: 1,518 right fits and 524 that had slid (``tools/bench belief --witnesses``).
-"""
-LONE_RIGHT, LONE_WRONG = np.array([0.049, 0.121, 0.830]), np.array([0.687, 0.139, 0.174])
-"""The same of the only finger in view."""
-BOTH_RIGHT = np.array([[106.0, 37.5, 54.5], [37.5, 120.0, 194.0], [54.5, 194.0, 473.0]]) / 1271.0
-BOTH_WRONG = np.array([[290.0, 15.5, 3.0], [15.5, 17.0, 11.5], [3.0, 11.5, 13.0]]) / 380.0
-"""Of both of two fingers."""
-REPEATS = 0.95
-"""Probability that an answer about ends only repeats that of the frame before, at 15 frames/s."""
 
 
 class Shadow:
@@ -88,8 +78,7 @@ class Shadow:
         self._frames: dict[int, Frame2d] = {}
         self._last_s: float | None = None
         self._jaw_m: float | None = None
-        self._answer = np.full(len(self._ends_of), -1)
-        self._asked_at: Array | None = None
+        self._ends_told = EndsTold(len(self._ends_of))
         self.newest: Believed | None = None
 
     @property
@@ -106,9 +95,8 @@ class Shadow:
         seen = self._seen(frame, looks, measurement)
         if seen is None:
             return
-        ends = self._tracker.ends(frame, looks[0])
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
-        told = self._told(ends, looks[0])
+        told = self._told(frame, looks, measurement, now_s)
         self.newest = self._belief.update(seen, dt_s, told, opening_m=self._opening_noise_m(frame))
         self._last_s = now_s
 
@@ -122,18 +110,20 @@ class Shadow:
         kept = math.exp(-abs(frame.jaw_opening_m - before) / (2.0 * self._jaw_sigma_m))
         return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
 
-    def _told(self, ends: FingerEndsSeen, look: Measurement) -> Told:
-        """Of fingers whose ends are out of view, nothing; an answer is news where the question was asked elsewhere."""
-        answer = np.where(ends.might > 0, np.minimum(ends.seen, 2), -1)
-        asked, together = np.flatnonzero(answer >= 0), np.full(2, np.nan)
-        tables = (LONE_RIGHT, LONE_WRONG) if len(asked) == 1 else (RIGHT, WRONG)
-        right, wrong = (np.where(answer >= 0, np.log(of[answer]), 0.0) for of in tables)
-        if len(asked) == len(answer) == 2:
-            together = np.log([of[answer[0], answer[1]] for of in (BOTH_RIGHT, BOTH_WRONG)])
-        here = self._asked_at is not None and _near(look, self._asked_at)
-        repeats, self._answer = (answer == self._answer) & (answer >= 0) & here, answer
-        self._asked_at = look.prediction.cam_T_grip
-        return Told(right, wrong, repeats, REPEATS, together)
+    def _told(self, frame: Frame, looks: list[Measurement], fit: Measurement, now_s: float) -> Told:
+        rows, at = np.zeros((len(self._gripper.edge_ids), SIZE)), np.zeros((len(looks), SIZE))
+        layout, columns = looks[0].prediction.layout, self._columns(looks[0])
+        for edge in np.unique(layout.edge):
+            rows[edge] = columns[layout.edge == edge].mean(axis=0)
+        for k, look in enumerate(looks):
+            at[k, MOTION] = perturbation_between(self._ref_T, look.prediction.cam_T_grip)
+            at[k, OPENING] = look.prediction.jaw_opening_m - self._reported_m(frame)
+        ends = [self._tracker.ends(frame, look) for look in looks]
+        by = next(k for k, look in enumerate(looks) if look is fit)
+        return self._ends_told.told(ends, looks, rows, at, by, now_s)
+
+    def _reported_m(self, frame: Frame) -> float:
+        return self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
 
     def _looks(self, frame: Frame, measurement: Measurement) -> list[Measurement]:
         """The frame as the rules' fit measured it, and at the heaviest places that this isn't near to: what isn't
@@ -155,10 +145,9 @@ class Shadow:
         main, edges = looks[0], len(self._gripper.edge_ids)
         assert isinstance(frame.image, np.ndarray)
         beside, noise = _beside(frame.image, main, edges), main.candidates.noise / math.sqrt(3.0)  # of three pixels
-        reported_m = self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
         away = [perturbation_between(self._ref_T, look.prediction.cam_T_grip) for look in looks]
         found = [
-            found_at(look, self._columns(look), at, reported_m, self._frames)
+            found_at(look, self._columns(look), at, self._reported_m(frame), self._frames)
             for look, at in zip(looks, away, strict=True)
         ]
         by = next(k for k, look in enumerate(looks) if look is fit)
@@ -166,7 +155,7 @@ class Shadow:
         most = max(1, max(len(of) for of, _ in all_lines))
         rows, (white, image_white) = np.zeros((edges, most, 2, SIZE)), np.ones((2, edges, most, 2))
         lines, searched, image = np.zeros((3, edges, most, 2))
-        strength, fitted, asked = np.full(edges, 1.0), np.full(edges, -1), np.zeros((edges, 2))
+        strength, fitted = np.full(edges, 1.0), np.full(edges, -1)
         for edge, (of, by_fit) in enumerate(all_lines):
             fitted[edge] = by_fit
             for k, line in enumerate(of):
@@ -177,16 +166,13 @@ class Shadow:
                 texture = TEXTURE_PX * _texture(beside, edge, noise)
                 texture /= max(abs(of[0].step), 1.0) * math.sqrt(of[0].points)
                 strength[edge] = min(texture, MOST_TEXTURE_PX) ** 2 + self._floor_px**2
-                asked[edge] = found[0][edge][0].searched_px if found[0][edge] else of[0].searched_px
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0
         if np.count_nonzero(shown) < FEWEST_EDGES:
             return None
         likeness = np.array([self._compare(e, beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         background = np.zeros(edges, np.int64)
-        return Seen(
-            rows, lines, white, searched, image, image_white, count, fitted, background, likeness, strength, asked
-        )  # fmt: skip
+        return Seen(rows, lines, white, searched, image, image_white, count, fitted, background, likeness, strength)
 
     def _compare(self, edge: int, now: Array, noise: float) -> float:
         """How like a picture (2, p) of an edge's sides is to that of it seen last; by how both are like the one with

@@ -212,7 +212,7 @@ class World:
         white = np.full(lines.shape, WHITE_PX**2)
         seen = Seen(
             rows, lines, white, searched, lines, white, count, fitted,
-            np.zeros(edges, np.int64), self._told_likeness(like), np.full(edges, BACKGROUND_PX**2), own,
+            np.zeros(edges, np.int64), self._told_likeness(like), np.full(edges, BACKGROUND_PX**2),
         )  # fmt: skip
         return Sample(seen, self._witnesses(first), light, self._g[MOTION].copy(), self._on.copy())
 
@@ -240,9 +240,11 @@ class World:
         creep = np.repeat([priors.creep_m_s, priors.creep_rad_s], 3) * math.sqrt(DT_S)
         small = np.repeat([priors.small_m, priors.small_rad], 3)
         self._g[MOTION] += rng.normal(size=6) * creep
-        if rng.random() < priors.small_per_s * DT_S * (10.0 if "rates" in self._differs else 1.0):
+        loose = bool(self._on[self.view.names.index("loose")])
+        often = priors.shakes_per_s if loose else priors.small_per_s * (10.0 if "rates" in self._differs else 1.0)
+        if rng.random() < -math.expm1(-often * DT_S):
             self._g[MOTION] += rng.normal(size=6) * small
-        if self._on[self.view.names.index("loose")]:
+        if loose:
             self._g[MOTION] += rng.normal(size=6) * small * math.sqrt(DT_S)
         if self._t == self.at:
             if self._fault in ("knock", "knock unseen"):
@@ -308,4 +310,6 @@ class World:
             if first or state != self._answered[f] or self._rng.random() >= MEMORY:
                 self._answer[f] = self._rng.choice(3, p=RIGHT if right else WRONG)
             self._answered[f], repeats[f] = state, not first and before == self._answer[f]
-        return Told(np.log(RIGHT[self._answer]), np.log(WRONG[self._answer]), repeats, MEMORY, np.full(2, np.nan))
+        right, wrong = (np.log(of[self._answer])[None] for of in (RIGHT, WRONG))
+        none, rows = np.full((1, 2), np.nan), self.view.rows[:, 0]
+        return Told(right, wrong, np.array([MEMORY]), 1.0 * repeats[None], none, np.zeros(1), rows, self._g[None], 0)
