@@ -15,6 +15,7 @@ import numpy as np
 
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
+from gripmon.belief.held import follow
 from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, lie_across, look, prepare
@@ -112,6 +113,7 @@ class Belief:
         self._of_ends = int(np.bitwise_or.reduce(self._table.ends))
         self._weighed = np.zeros(1, bool)  # of each hypothesis: it sees no end, and a knock since is weighed beside it
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
+        self._shaken = np.zeros((0, SIZE))  # the noise that g got before this frame where the mount is loose
 
     @property
     def weights(self) -> dict[int, float]:
@@ -184,6 +186,7 @@ class Belief:
             rows[range(6), range(6)] = np.repeat([step_m * root_dt, step_rad * root_dt], 3)
             rows[6, LIGHT], rows[7, OPENING] = priors.light_px * math.sqrt(1.0 - light * light), opening_m
             factors.append(rows[rows.any(axis=1)])
+        self._shaken = factors[1]
         for h in range(self._hypotheses):
             move(self._bank, h, lag, light)
             factor = factors[int(self._is_loose(h))]
@@ -276,10 +279,14 @@ class Belief:
     def _node(self, i: int, h: int, jump: int, before: float, factor: Array, asked: Asked) -> None:
         nodes = self._nodes
         nodes.parent[i], nodes.jump[i], nodes.before[i] = h, jump, before
-        doubted = edges_of(int(self._bank.doubts[h]), self._table.edges)
+        doubts = int(self._bank.doubts[h])
+        doubted = edges_of(doubts, self._table.edges)
         prepare(nodes, i, self._bank, h, factor, asked.seen, self._sizes, doubted)
         lie_across(nodes, i, self._bank, asked.seen, self._table, self._sizes)
         look(nodes, i, self._bank, asked.told, self._table)
+        noise = np.concatenate([self._shaken, factor]) if self._is_loose(h) else factor
+        held = edges_of(doubts & self._table.held, self._table.edges)
+        follow(nodes, i, self._bank, h, noise, asked.seen, held, self.priors.missed)
 
     def _keep(self, n: int, asked: Asked) -> float:
         bank, other, nodes, candidates = self._bank, self._other, self._nodes, self._candidates

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gripmon.belief.doubts import Table, edges_of
-from gripmon.belief.nodes import Nodes, weigh
+from gripmon.belief.nodes import Nodes, across, weigh
 from gripmon.belief.rows import add_noise, foreign, forward, learn
 from gripmon.belief.search import Candidates
 from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
@@ -22,11 +22,12 @@ the risk.
 
 @compiled
 def posterior(
-    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, near: float, mean: Array, covariance: Array
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, added: float, near: float, mean: Array,
+    covariance: Array,
 ) -> None:  # fmt: skip
     """``mean`` (23,), which is that before the frame, and ``covariance`` (23, 23) of g after it."""
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
-    weigh(nodes, i, seen, doubted, held, near, root, solution)
+    weigh(nodes, i, seen, doubted, held, added, near, root, solution)
     half = np.empty((SIZE, SIZE))  # row j: root of M^-1 L', so that the covariance is half half'
     for j in range(SIZE):
         for k in range(SIZE):
@@ -102,7 +103,7 @@ def keep(
         for j in range(SIZE):
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-        posterior(nodes, i, seen, doubted, held, near, mean, covariance)
+        posterior(nodes, i, seen, doubted, held, across(nodes, i, doubts), near, mean, covariance)
         twin, first = -1, -1
         for q in range(listed if merging else 0):
             alike = same_doubts(into.doubts[q], doubts, table)

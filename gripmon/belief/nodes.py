@@ -50,7 +50,9 @@ class Nodes(NamedTuple):
     (n, e) instead.  ``across`` (n, d), by how much that of each doubt's edges together is larger since a straight thing
     may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown; ``hope`` (n,),
     by how much more a place would explain where all edges were on lines, of those that are on none; ``looked`` (n, f):
-    at which place a finger's ends were looked at, -1 for none.
+    at which place a finger's ends were looked at, -1 for none.  Edges (bits) that ``follows`` (n,) names were held and
+    go where the gripper goes: with ``goes`` (n, e), ``going`` (n, e, 2, 23), ``gone`` (n, e, 2) instead of ``base``,
+    ``rows`` and ``missing``.
     """
 
     parent: Ints
@@ -73,6 +75,10 @@ class Nodes(NamedTuple):
     pull: Array
     hope: Array
     looked: Ints
+    follows: Ints
+    goes: Array
+    going: Array
+    gone: Array
 
     @classmethod
     def empty(cls, nodes: int, edges: int, doubts: int, fingers: int) -> Nodes:
@@ -84,6 +90,7 @@ class Nodes(NamedTuple):
             np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
             np.zeros((n, e), bool), np.zeros((n, e)), np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)),
             np.zeros((n, SIZE)), np.zeros(n), np.zeros((n, fingers), np.int64),
+            np.zeros(n, np.int64), np.zeros((n, e)), np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)),
         )  # fmt: skip
 
 
@@ -331,12 +338,30 @@ def add_row(information: Array, pull: Array, white: Array, zeta: float, sign: fl
 
 @compiled
 def weigh(
-    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, near: float, root: Array, solution: Array
-) -> tuple[float, float]:
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, added: float, near: float, root: Array, solution: Array
+) -> tuple[float, float]:  # fmt: skip
     """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper and others may
     lie ``near`` (a variance, px^2); and the surprise: by how much the squares of its own rows exceed what is expected,
-    halved.  ``root`` (23, 23) of M and ``solution`` (23,) M^-1 b are left behind.
+    halved.  ``added``: what is known of edges that are held, over what each says.  ``root`` (23, 23) of M and
+    ``solution`` (23,) M^-1 b are left behind.
     """
+    log, surprise = sum_of(nodes, i, seen, doubted, held, 0, near, root, solution)
+    log += added
+    following = nodes.follows[i] & held
+    if following:
+        other_root, other = np.empty((SIZE, SIZE)), np.empty(SIZE)
+        following_log, following_surprise = sum_of(nodes, i, seen, doubted, held, following, near, other_root, other)
+        if following_log > log:
+            root[:, :], solution[:] = other_root, other
+            return following_log, following_surprise
+    return log, surprise
+
+
+@compiled
+def sum_of(
+    nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, following: int, near: float, root: Array, solution: Array
+) -> tuple[float, float]:  # fmt: skip
+    """:func:`weigh`, where what is held goes where the gripper goes on edges ``following`` (bits), or stays."""
     information, pull = np.empty((SIZE, SIZE)), np.empty(SIZE)
     for j in range(SIZE):
         pull[j] = nodes.pull[i, j]
@@ -348,12 +373,18 @@ def weigh(
         if seen.found[edge] == 0:
             continue
         if (doubted >> edge) & 1:
-            if nodes.joint[i, edge]:
+            if nodes.joint[i, edge] and not (following >> edge) & 1:
                 joint, far = True, far + nodes.far[i, edge]
             else:
                 total += nodes.held[i, edge] if (held >> edge) & 1 else nodes.free[i, edge]
             for row in range(2):
                 add_row(information, pull, nodes.rows[i, edge, row], nodes.missing[i, edge, row], -1.0)
+            if (following >> edge) & 1:
+                total += nodes.goes[i, edge] - nodes.held[i, edge]
+                for row in range(2):
+                    add_row(information, pull, nodes.going[i, edge, row], nodes.gone[i, edge, row], 1.0)
+                    squares += nodes.gone[i, edge, row] ** 2
+                own += 2
         else:
             total += nodes.base[i, edge]
             if nodes.line[i, edge] < 0:

@@ -73,8 +73,10 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     table, before = asked.table, bank.doubts[nodes.parent[i]]
     doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-    log, surprise = weigh(nodes, i, asked.seen, doubted, held, asked.near, root, solution)
-    log += nodes.before[i] + log_transition(before, doubts, asked.chances) + across(nodes, i, doubts)
+    log, surprise = weigh(
+        nodes, i, asked.seen, doubted, held, across(nodes, i, doubts), asked.near, root, solution
+    )  # fmt: skip
+    log += nodes.before[i] + log_transition(before, doubts, asked.chances)
     candidates.node[n], candidates.doubts[n] = i, doubts
     candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first, nodes.looked[i])
     candidates.surprise[n], candidates.expanded[n] = surprise, False
@@ -123,8 +125,7 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
     before = bank.doubts[nodes.parent[i]]
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     covered, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-    log, _ = weigh(nodes, i, seen, covered, held, asked.near, root, solution)
-    log += across(nodes, i, doubts)
+    log, _ = weigh(nodes, i, seen, covered, held, across(nodes, i, doubts), asked.near, root, solution)
     candidates.expanded[c] = True
     for k in range(len(table.edges)):
         changed = doubts ^ (1 << k)
