@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,24 @@ from gripmon.model.outputs import Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord
 
 
+_START_WITHIN_S = 60.0
+
+
 class _Said(Output):
     """An output that writes to standard output."""
 
     def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         os.write(1, b"%d\n" % record.seq)
+
+
+def _process_of(recorder: SwitchedRecorder) -> int:
+    """It starts beside the loop; RuntimeError if it doesn't within a minute."""
+    end_s = time.monotonic() + _START_WITHIN_S
+    while recorder.process_id is None:
+        if time.monotonic() > end_s:
+            raise RuntimeError("no recording process began")
+        time.sleep(0.01)
+    return recorder.process_id
 
 
 def main(ring_path: str, directory: str, frames: str) -> None:
@@ -32,7 +46,7 @@ def main(ring_path: str, directory: str, frames: str) -> None:
     config = scene.config_for((width_px, height_px))
     recorder = SwitchedRecorder(config, Path(directory))
     recorder.on = True
-    os.write(1, b"recording %d\n" % (recorder.process_id or 0))
+    os.write(1, b"recording %d\n" % _process_of(recorder))
     harness.run_loop(config, harness.RingSource(ring, int(frames), paced=True), _Said(), recorder)
 
 
