@@ -18,7 +18,6 @@ from benchmarks.switched import SwitchedRecorder
 from gripmon.model.outputs import Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord
 
-
 _START_WITHIN_S = 60.0
 
 
