@@ -9,6 +9,7 @@ from support.meters import box_gripper, difference, moved
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
 from support.watched import frames_of, new_monitor, reference_of, watched
 
+from gripmon.belief.doubts import Told
 from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, SIZE, Seen
 from gripmon.model.camera import make_camera
 from gripmon.model.poses import perturb
@@ -27,6 +28,11 @@ class Watching(Shadow):
     """What was seen of the newest frame."""
 
     seen: Seen
+    told: Told
+
+    def _told(self, frame: Frame, looks: list[Measurement], fit: Measurement, now_s: float) -> Told:
+        self.told = super()._told(frame, looks, fit, now_s)
+        return self.told
 
     def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
         seen = super()._seen(frame, looks, fit)
@@ -193,6 +199,27 @@ def test_the_gripper_is_looked_for_where_it_is_believed_to_be_though_the_fit_sli
     assert nearest.max() < 1.0
     assert shadow.newest is not None and shadow.newest.known
     assert np.linalg.norm(shadow.newest.motion[:3]) < 1e-4
+
+
+def test_ends_are_asked_wherever_the_frame_was_searched() -> None:
+    """The camera slid along the fingers by 6 mm: no line is left at the old ends, whose answer speaks of these alone;
+    what is asked again tells little.
+    """
+    pose = nominal_cam_T_grip()
+    monitor = Monitor(make_camera(PAPER_LENS), sharp_gripper(), MonitorSettings(), reference_of(pose))
+    slid = perturb(pose, np.concatenate([6e-3 * pose[:3, :3] @ monitor._tracker.finger_axis, np.zeros(3)]))
+    image, opening_m = picture(slid)
+    frame = Frame(seq=0, stamp_ns=0, image=image, jaw_opening_m=opening_m)
+    fit = monitor._tracker.measure(frame, slid, 0.0)
+    shadow = Watching(monitor._camera, sharp_gripper(), monitor._tracker, reference_of(pose), MonitorSettings())
+    shadow.see(frame, fit, 0.0)
+    told, away = shadow.told, np.linalg.norm(shadow.told.at[:, :3], axis=1)
+    there, old = int(np.argmax(away)), int(np.argmin(away))
+    assert away[there] > 5e-3 > 1e-4 > away[old] and told.fit == there
+    assert (told.right[there] > told.wrong[there]).all() and (told.right[old] < told.wrong[old]).all()
+    assert (told.memory == 0.0).all()
+    shadow.see(frame, fit, FRAME_S)
+    assert (shadow.told.memory[[there, old]] > 0.4).all() and (shadow.told.repeats[[there, old]] == 1.0).all()
 
 
 def test_records_are_the_same_with_and_without() -> None:

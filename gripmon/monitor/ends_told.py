@@ -7,7 +7,6 @@ one scene are more alike than those of all, so that the second to flicker tells 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -36,20 +35,26 @@ FORGOTTEN = 0.05
 
 @dataclass
 class _Place:
-    """Where ends were asked, and the answers there: of each finger and of all together, by weight."""
+    """Where ends were asked, and the answers there, each by how long ago it was: of each finger and of all together."""
 
     cam_T_grip: Array
-    of: list[Counter[int]]
-    together: Counter[tuple[int, ...]] = field(default_factory=Counter)
+    of: list[dict[int, float]]
+    together: dict[tuple[int, ...], float] = field(default_factory=dict)
 
     def fade(self, kept: float) -> None:
-        for counts in (*self.of, self.together):
-            for answer in counts:
-                counts[answer] *= kept  # type: ignore[assignment]  # weights, not numbers
+        """All of them, to so much of their weight."""
+        self.of = [{answer: kept * weight for answer, weight in counts.items()} for counts in self.of]
+        self.together = {answer: kept * weight for answer, weight in self.together.items()}
+
+    def hear(self, answer: tuple[int, ...]) -> None:
+        """One more."""
+        self.together[answer] = self.together.get(answer, 0.0) + 1.0
+        for counts, a in zip(self.of, answer, strict=True):
+            counts[a] = counts.get(a, 0.0) + 1.0
 
     @property
     def heard(self) -> float:
-        return float(sum(self.together.values()))
+        return sum(self.together.values())
 
 
 class EndsTold:
@@ -81,15 +86,13 @@ class EndsTold:
             right[k], wrong[k] = (np.where(answer >= 0, np.log(of[answer]), 0.0) for of in tables)
             if len(asked) == len(answer) == 2:
                 together[k] = np.log([of[answer[0], answer[1]] for of in (BOTH_RIGHT, BOTH_WRONG)])
-            place = self._place(look)
+            place, given = self._place(look), tuple(answer.tolist())
             heard = place.heard
             memory[k] = heard / (heard + 1.0)
             if heard > 0.0:
-                repeats[k] = [counts[a] / heard for counts, a in zip(place.of, answer.tolist(), strict=True)]
-                repeats_together[k] = place.together[tuple(answer.tolist())] / heard
-            for counts, a in zip(place.of, answer.tolist(), strict=True):
-                counts[a] += 1
-            place.together[tuple(answer.tolist())] += 1
+                repeats[k] = [counts.get(a, 0.0) / heard for counts, a in zip(place.of, given, strict=True)]
+                repeats_together[k] = place.together.get(given, 0.0) / heard
+            place.hear(given)
         return Told(right, wrong, memory, repeats, together, repeats_together, rows, at, fit)
 
     def _place(self, look: Measurement) -> _Place:
@@ -97,5 +100,5 @@ class EndsTold:
         for place in self._places:
             if look.prediction.moved_px(perturbation_between(cam_T_grip, place.cam_T_grip)) < LOOKED_PX:
                 return place
-        self._places.append(_Place(cam_T_grip, [Counter() for _ in range(self._fingers)]))
+        self._places.append(_Place(cam_T_grip, [{} for _ in range(self._fingers)]))
         return self._places[-1]
