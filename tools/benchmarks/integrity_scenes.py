@@ -236,16 +236,20 @@ def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple
 
 
 def _placed_short(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
-    """As usual, then shifted until only ``SHORT_PX`` of the fingers are seen between their tips and the border."""
+    """As usual, then shifted until of the finger that is seen least only ``SHORT_PX`` are between its tip and the
+    border: a roll of the camera shows more of the other.
+    """
     for _ in range(1000):
         cam_T_grip, opening_m = _placed(rng, camera, gripper)
         short_px = float(rng.uniform(*SHORT_PX))
         points = gripper.points_grip_m(opening_m)
-        tips = np.isin(np.arange(len(points)), gripper.corner_points)
+        corners = np.isin(np.arange(len(points)), gripper.corner_points)
+        tips = [corners & (gripper.point_finger == finger) for finger in range(len(gripper.finger_ids))]
         for _ in range(5):  # Newton's: the lens is nearly linear there
             v_px = camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])[:, 1]
-            down = bool(np.nanmean(v_px[~tips]) > np.nanmean(v_px[tips]))
-            tip_px = float(v_px[tips].min() if down else v_px[tips].max())
+            down = bool(np.nanmean(v_px[~corners]) > np.nanmean(v_px[corners]))
+            nearest_px = [float(v_px[tip].min() if down else v_px[tip].max()) for tip in tips]
+            tip_px = max(nearest_px) if down else min(nearest_px)
             off_px = tip_px - (camera.height_px - 1.0 - short_px if down else short_px)
             cam_T_grip[1, 3] -= off_px * cam_T_grip[2, 3] / camera.fy_px
         if abs(off_px) < 1.0:
