@@ -176,6 +176,7 @@ class World:
         self._hides = rng.random(len(first)) < 0.5
         self._place, self._around = np.zeros((edges, 2)), np.zeros((edges, 2))
         self._size, self._was = np.ones(edges), np.zeros(edges, bool)
+        self._before = np.zeros((edges, 2))
         self._answer, self._answered = np.zeros(2, int), np.full(2, -1)
         self._moving, self._t = bool(rng.random() < 0.5), -1
         self.at = int(rng.integers(10, frames - 10)) if fault else -1
@@ -202,6 +203,7 @@ class World:
         self._back = like[:, None] * self._back + np.sqrt(1.0 - like[:, None] ** 2) * new
         own = self.view.rows @ self._g
         foreign = self._foreign(own, like)
+        self._before = own
         shown = np.ones(edges, bool)
         for i in np.flatnonzero(self._on & self._hides):
             if self.view.doubts[i].held and self.view.names[i] in ("ends", "all ends", "inner", "side"):
@@ -285,7 +287,9 @@ class World:
         self._on = now
 
     def _foreign(self, own: Array, like: Array) -> Flags:
-        """Which edges are another thing's; where these lie is drawn when an edge begins to be one."""
+        """Which edges are another thing's; where these lie is drawn when an edge begins to be one, and what is held
+        goes where the gripper goes.
+        """
         rng, priors, doubts = self._rng, self._priors, self.view.doubts
         foreign, held = np.zeros(len(like), bool), np.zeros(len(like), bool)
         for i in np.flatnonzero(self._on):
@@ -294,6 +298,7 @@ class World:
         stays = np.where(held | (like >= STILL), 1.0, like)[:, None]
         fresh = rng.normal(size=self._place.shape) * self._size[:, None]
         self._place = stays * self._place + np.sqrt(1.0 - stays**2) * fresh
+        self._around += np.where(held[:, None], own - self._before, 0.0)
         for e in np.flatnonzero(foreign & ~self._was):
             self._size[e] = priors.near_px if rng.random() < 0.5 else priors.far_px
             self._place[e], self._around[e] = rng.normal(0.0, self._size[e], 2), own[e]
