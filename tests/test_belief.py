@@ -318,7 +318,7 @@ def test_a_line_of_its_own_where_nobody_looked_is_not_missed() -> None:
     anything = stats.norm(0.0, np.sqrt(49.0 + 4e-4)).logpdf(frame.lines[1, 0] - frame.searched[1, 0]).sum()
     for off_px, missed in ((3.0, 0.05), (12.0, 1.0)):
         places = frame.searched[1] + np.array([off_px, 0.0])
-        of, log = which(frame, 1, places, np.full((1, 2), 1e-3), sizes)
+        of, log, unsearched = which(frame, 1, places, np.full((1, 2), 1e-3), sizes)
         assert of == -1 and log == pytest.approx(np.log(missed) + anything)
 
 

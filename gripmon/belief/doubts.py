@@ -242,3 +242,8 @@ def answered(log: float, same: bool, repeats: float, memory: float) -> float:
 def bits(flags: Sequence[bool] | Flags) -> int:
     """A bit for each flag, the first the lowest."""
     return int(sum(1 << int(k) for k in np.flatnonzero(np.asarray(flags))))
+
+
+def flags_of(of: int, count: int) -> Flags:
+    """(count,) whether each bit is set."""
+    return np.array([bool((of >> k) & 1) for k in range(count)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from gripmon.belief.doubts import Table, edges_of
 from gripmon.belief.nodes import Nodes, across, weigh
-from gripmon.belief.rows import add_noise, foreign, forward, learn
+from gripmon.belief.rows import add_noise, foreign, forget, forward, learn, not_drawn
 from gripmon.belief.search import Candidates
 from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
 from gripmon.model.compiled import compiled
@@ -169,5 +169,9 @@ def remember(
             if (doubted >> edge) & 1:
                 fresh, stays = (before >> edge) & 1 == 0, (held >> edge) & 1 == 1
                 foreign(into, q, seen, edge, fresh, stays, sizes, nodes.at[i, edge], nodes.wide[i, edge], True, True)
+            elif seen.found[edge] > 0 and nodes.unsearched[i, edge]:
+                fresh = not_drawn(into, q, edge)
+                foreign(into, q, seen, edge, fresh, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, True)
             elif seen.found[edge] > 0 and nodes.line[i, edge] >= 0:
+                forget(into, q, edge)
                 learn(into, q, seen, edge, nodes.line[i, edge])

@@ -50,7 +50,8 @@ class Nodes(NamedTuple):
     (n, e) instead.  ``across`` (n, d), by how much that of each doubt's edges together is larger since a straight thing
     may lie over the ends; ``information`` M - 1 (n, 23, 23) and ``pull`` b (n, 23) of all edges shown; ``hope`` (n,),
     by how much more a place would explain where all edges were on lines, of those that are on none; ``looked`` (n, f):
-    at which place a finger's ends were looked at, -1 for none.  Edges (bits) that ``follows`` (n,) names were held and
+    at which place a finger's ends were looked at, -1 for none; ``unsearched`` (n, e): nobody looked where an edge would
+    be.  Edges (bits) that ``follows`` (n,) names were held and
     go where the gripper goes: with ``goes`` (n, e), ``going`` (n, e, 2, 23), ``gone`` (n, e, 2) instead of ``base``,
     ``rows`` and ``missing``.
     """
@@ -75,6 +76,7 @@ class Nodes(NamedTuple):
     pull: Array
     hope: Array
     looked: Ints
+    unsearched: Flags
     follows: Ints
     goes: Array
     going: Array
@@ -90,7 +92,8 @@ class Nodes(NamedTuple):
             np.zeros((n, e, 2)), np.zeros((n, e, 2)), np.zeros((n, e)), np.zeros((n, e)), np.zeros((n, e)),
             np.zeros((n, e), bool), np.zeros((n, e)), np.zeros((n, doubts)), np.zeros((n, SIZE, SIZE)),
             np.zeros((n, SIZE)), np.zeros(n), np.zeros((n, fingers), np.int64),
-            np.zeros(n, np.int64), np.zeros((n, e)), np.zeros((n, e, 2, SIZE)), np.zeros((n, e, 2)),
+            np.zeros((n, e), bool), np.zeros(n, np.int64), np.zeros((n, e)), np.zeros((n, e, 2, SIZE)),
+            np.zeros((n, e, 2)),
         )  # fmt: skip
 
 
@@ -121,12 +124,12 @@ def prepare(nodes: Nodes, i: int, bank: Bank, h: int, factor: Array, seen: Seen,
     nodes.hope[i] = 0.0
     expected = Expected(np.empty((lines, 2)), np.empty((lines, 2, SIZE)), np.empty((lines, 2)), np.empty(2))
     for edge in range(len(seen.found)):
-        nodes.joint[i, edge] = False
+        nodes.joint[i, edge] = nodes.unsearched[i, edge] = False
         nodes.at[i, edge], nodes.wide[i, edge] = seen.searched[edge, 0], 0.0
         nodes.base[i, edge] = nodes.free[i, edge] = nodes.held[i, edge] = 0.0
         if seen.found[edge] > 0:
             expect(expected, nodes.root[i], bank, h, factor, gain, between, seen, edge)
-            take(nodes, i, expected, seen, edge, sizes)
+            take(nodes, i, bank, h, expected, seen, edge, sizes)
             leave(nodes, i, bank, h, seen, edge, sizes, (doubted >> edge) & 1 == 0 or not_drawn(bank, h, edge))
 
 
@@ -164,10 +167,10 @@ def expect(
 
 
 @compiled
-def take(nodes: Nodes, i: int, expected: Expected, seen: Seen, edge: int, sizes: Array) -> None:
+def take(nodes: Nodes, i: int, bank: Bank, h: int, expected: Expected, seen: Seen, edge: int, sizes: Array) -> None:
     """An edge for one of its lines, or for none of them."""
-    of, share = which(seen, edge, expected.place, expected.prior + expected.noise, sizes)
-    nodes.line[i, edge], nodes.base[i, edge] = of, share
+    of, share, unsearched = which(seen, edge, expected.place, expected.prior + expected.noise, sizes)
+    nodes.line[i, edge], nodes.base[i, edge], nodes.unsearched[i, edge] = of, share, unsearched
     usual = max(of, 0)
     nodes.at[i, edge], nodes.wide[i, edge] = expected.place[usual], expected.prior[usual] + expected.noise
     for row in range(2):
@@ -187,6 +190,11 @@ def take(nodes: Nodes, i: int, expected: Expected, seen: Seen, edge: int, sizes:
         add_row(nodes.information[i], nodes.pull[i], white, zeta, 1.0)
     if of < 0:
         nodes.hope[i] -= share
+    if unsearched:
+        fresh = not_drawn(bank, h, edge)
+        nodes.base[i, edge] = foreign(
+            bank, h, seen, edge, fresh, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, False
+        )  # fmt: skip
 
 
 @compiled
@@ -206,13 +214,13 @@ def leave(nodes: Nodes, i: int, bank: Bank, h: int, seen: Seen, edge: int, sizes
 
 
 @compiled
-def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) -> tuple[int, float]:
+def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) -> tuple[int, float, bool]:
     """The line there that an edge of the gripper is taken for, by each line's rows expected at ``places`` (l, 2) with
     variances ``spreads`` (l, 2), and the log probability of that; or that of its being none of them, with what these
-    say as anything's.
+    say as anything's; and whether it can't be among them, since no search reached the place: what was found there is
+    other things', maybe the gripper's own, which stay.
 
-    Where it is known to less than lines lie apart, the fit chooses, as for all edges together.  Where no search reached
-    the place, its own line can't be among those found.
+    Where it is known to less than lines lie apart, the fit chooses, as for all edges together.
     """
     count, far, missed, reached = seen.found[edge], sizes[1], sizes[2], False
     log, any_of, best, most = -math.log(count), 0.0, -1, -math.inf
@@ -228,12 +236,12 @@ def which(seen: Seen, edge: int, places: Array, spreads: Array, sizes: Array) ->
             best, most = of, near
     none, apart = math.log(missed) + math.log(any_of) if missed > 0.0 else -math.inf, spreads[0, 0] > APART_PX**2
     if apart and seen.fitted[edge] >= 0:
-        return seen.fitted[edge], math.log(1.0 - missed) + log
+        return seen.fitted[edge], math.log(1.0 - missed) + log, False
     if not (reached or apart) and missed > 0.0:
-        return -1, math.log(any_of)
+        return -1, math.log(any_of), True
     if missed > 0.0 and (apart or math.log(1.0 - missed) + log + most < none):
-        return -1, none
-    return best, math.log(1.0 - missed) + log
+        return -1, none, False
+    return best, math.log(1.0 - missed) + log, False
 
 
 @compiled

@@ -245,6 +245,13 @@ def drawn(place: Array, spread: Array, missing: float, white: float, own: float)
 
 
 @compiled
+def forget(bank: Bank, h: int, edge: int) -> None:
+    """What was seen of other things' edges in its place."""
+    for slot in range(FOREIGN_KINDS * MEMORIES):
+        bank.place_spread[h, edge, slot, :, :] = 0.0
+
+
+@compiled
 def not_drawn(bank: Bank, h: int, edge: int) -> bool:
     """Whether nothing was seen of another thing's edge since the doubt began."""
     return bank.place_spread[h, edge, 0, 0, 0] == 0.0
@@ -361,8 +368,7 @@ def foreign(
     """
     count = seen.found[edge]
     if fresh and keep:
-        for slot in range(FOREIGN_KINDS * MEMORIES):
-            bank.place_spread[h, edge, slot, :, :] = 0.0
+        forget(bank, h, edge)
     fresh = fresh or not_drawn(bank, h, edge)
     if count == 0 and fresh:
         return 0.0
