@@ -29,6 +29,17 @@ def test_shared_images_keep_apart() -> None:
     ring.close()
 
 
+def test_an_image_that_another_one_took_the_place_of_is_none() -> None:
+    ring = SharedImages(2, WIDTH_PX, HEIGHT_PX)
+    first, second, third = (np.full((HEIGHT_PX, WIDTH_PX), grey, np.uint8) for grey in (1, 2, 3))
+    one, two = ring.put(0, first), ring.put(1, second)
+    kept = ring.copy(one)
+    ring.put(2, third)
+    assert kept is not None and (kept == first).all(), "a copy stays what it was"
+    assert ring.copy(one) is None and (ring.copy(two) == second).all()
+    ring.close()
+
+
 def test_deep_pixels_become_8_bit() -> None:
     np.testing.assert_array_equal(to_8_bit(np.array([[0, 255, 256, 65535]], np.uint16)), [[0, 0, 1, 255]])
     floats = np.array([[0.0, 0.5, 1.0, 7.0, -1.0, np.nan]], np.float32)

@@ -74,14 +74,14 @@ def faded(colour: Colour, alpha: int) -> Colour:
 
 
 class Sender:
-    """Sends columns with both timelines."""
+    """Sends columns with both timelines, to entities below ``root`` ("recorded/")."""
 
-    def __init__(self, stream: rr.RecordingStream):
-        self.stream = stream
+    def __init__(self, stream: rr.RecordingStream, root: str = ""):
+        self._stream, self._root = stream, root
 
     def static(self, path: str, *archetypes: rr.AsComponents) -> None:
         for archetype in archetypes:
-            self.stream.log(path, archetype, static=True)
+            self._stream.log(f"{self._root}{path}", archetype, static=True)
 
     def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
         """Send columns; without stamps on the frame timeline only."""
@@ -89,7 +89,7 @@ class Sender:
         if stamps_ns:
             times = np.array(stamps_ns, np.int64).astype("datetime64[ns]")
             indexes.insert(0, rr.TimeColumn("capture_time", timestamp=times))
-        self.stream.send_columns(path, indexes, columns)
+        self._stream.send_columns(f"{self._root}{path}", indexes, columns)
 
     def frames(self, path: str, rows: Sequence[Row], columns: rr.ComponentColumnList) -> None:
         self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)

@@ -268,14 +268,14 @@ def _face_normals(vertices: Array, triangles: np.ndarray) -> Array:
     return out
 
 
-def layout_file(scene: Scene) -> bytes:
-    """The layout as a rerun blueprint file, for :meth:`rerun.RecordingStream.log_file_from_contents`.
+def layout_file(layout: rrb.Blueprint) -> bytes:
+    """A layout as a rerun blueprint file, for :meth:`rerun.RecordingStream.log_file_from_contents`.
 
     Each ``send_blueprint`` leaks two threads and more than a MiB; logging this file leaks nothing.
     """
     descriptor = os.memfd_create("gripmon-layout")
     try:
-        make_blueprint(scene).save(APPLICATION_ID, f"/proc/self/fd/{descriptor}")
+        layout.save(APPLICATION_ID, f"/proc/self/fd/{descriptor}")
         return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
     finally:
         os.close(descriptor)

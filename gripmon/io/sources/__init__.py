@@ -79,9 +79,7 @@ def open_source(
     """Start a source; paths in its settings are relative to ``relative_to``, the folder of the configuration file.
 
     Only the simulator needs a ``scene``; a camera on the network needs the session, the monitor's keys and, as one of
-    ROS 2, the size of the images: (width, height), by default that of the scene's camera.  The simulator's real-time
-    camera starts another Python process by ``multiprocessing``, so a script that opens one needs the guard
-    ``if __name__ == "__main__"``.
+    ROS 2, the size of the images: (width, height), by default that of the scene's camera.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that isn't a
     video, and a device of unknown form.  A camera that is absent at present is not an error: the source waits for it.
