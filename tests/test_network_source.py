@@ -27,7 +27,7 @@ from gripmon.io.sources import (
     Waiting,
     open_source,
 )
-from gripmon.io.sources.network import clock_fault
+from gripmon.io.sources.lateness import clock_fault
 from gripmon.io.wire import Keys, Link, PublishSettings, link
 from gripmon.model.records import Frame, Refusal
 
