@@ -21,7 +21,7 @@ from gripmon.client.age import steady_s
 from gripmon.client.commands import ask
 from gripmon.client.network import FORKED, Joined, MonitorName, NotCarriedOut, monitor_name, start_of
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, in_zenohs_thread
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.records import (
     AlertRecord,
     CommandName,

@@ -14,8 +14,9 @@ from gripmon.io.sources.bags import BagSettings, BagSource, is_rosbag2
 from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
 from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
 from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
-from gripmon.io.sources.live import LiveCamera, LiveSettings, NewestFrame
+from gripmon.io.sources.live import LiveCamera, LiveSettings
 from gripmon.io.sources.network import ArrivingCamera, NetworkCamera, NetworkSettings
+from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.ros2 import Ros2Camera, Ros2CameraSettings
 from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link

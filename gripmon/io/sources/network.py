@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -12,6 +11,7 @@ import msgspec
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, Waiting
 from gripmon.io.sources.lateness import Lateness, clock_fault, lasting_fault
+from gripmon.io.sources.newest import Newest
 from gripmon.io.sources.payload import (
     PayloadError,
     WrongSizeError,
@@ -20,7 +20,7 @@ from gripmon.io.sources.payload import (
     read_note,
 )
 from gripmon.io.wire import Link, in_zenohs_thread
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.io.wire.session import KEY_PATTERN
 from gripmon.model.images import JPEG, PNG
 from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
@@ -140,10 +140,8 @@ class ArrivingCamera(ABC):
         self.key = key
         self._silent_after_s = silent_after_s
         self._malformed = Malformed("frame", key)
-        self._changed = threading.Condition()
-        self._slot: Arrival | None = None
-        self._closed = False
-        self._dropped = self._dropped_before = self._handed_over = 0
+        self._arrivals: Newest[Arrival] = Newest()
+        self._handed_over = 0
         self._newest: tuple[float, int] | None = None  # of good payloads: monotonic time of arrival, stamp
         self._last_arrival_s: float | None = None
         self._clock_fault = ""
@@ -160,11 +158,11 @@ class ArrivingCamera(ABC):
     @property
     def connected(self) -> bool:
         last_s = self._last_arrival_s
-        return not self._closed and last_s is not None and time.monotonic() - last_s < self._silent_after_s
+        return not self._arrivals.ended and last_s is not None and time.monotonic() - last_s < self._silent_after_s
 
     @property
     def dropped(self) -> int:
-        return self._dropped
+        return self._arrivals.dropped
 
     @property
     def malformed(self) -> int:
@@ -179,7 +177,8 @@ class ArrivingCamera(ABC):
     def read(self) -> Frame | Waiting | None:
         deadline_s = time.monotonic() + READ_TIMEOUT_S
         fault, refusal = "", Refusal.NOT_AN_IMAGE
-        while (arrival := self._take(deadline_s)) is not None:
+        # Payloads without end may all be malformed.
+        while (left_s := deadline_s - time.monotonic()) > 0.0 and (arrival := self._arrivals.take(left_s)) is not None:
             try:
                 content = self._content(arrival)
             except Exception as error:  # noqa: BLE001  malformed input from anyone must not end the monitor
@@ -191,40 +190,20 @@ class ArrivingCamera(ABC):
                 continue
             self._malformed.good()
             return self._frame(arrival, content)
-        if self._closed:
+        if self._arrivals.ended:
             return None
         if fault:
             return Frame(self._next_seq(), self._stamp_now_ns(), None, None, self.key, fault, refusal)
         return Waiting(self._why_silent())
 
     def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._slot = None
-            self._changed.notify_all()
+        self._arrivals.end(discard=True)
 
     def _arrived(self, sample: Any) -> None:
         """Take a sample, in the network's thread."""
         arrival = Arrival(sample, time.time_ns(), time.monotonic())
-        with self._changed:
-            if self._closed:
-                return
-            if self._slot is not None:
-                self._dropped += 1
-            self._slot = arrival
-            self._last_arrival_s = arrival.monotonic_s
-            self._changed.notify_all()
-
-    def _take(self, deadline_s: float) -> Arrival | None:
-        """The next sample that has arrived, or arrives until the deadline."""
-        with self._changed:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0.0:  # payloads without end may all be malformed
-                return None
-            self._changed.wait_for(lambda: self._slot is not None or self._closed, left_s)
-            arrival, self._slot = self._slot, None
-            self._dropped_before = self._dropped
-            return arrival
+        self._last_arrival_s = arrival.monotonic_s
+        self._arrivals.put(arrival)
 
     def _frame(self, arrival: Arrival, content: Content) -> Frame:
         stamp_ns = arrival.unix_ns if content.stamp_ns is None else content.stamp_ns
@@ -238,7 +217,7 @@ class ArrivingCamera(ABC):
         )  # fmt: skip
 
     def _next_seq(self) -> int:
-        seq = self._handed_over + self._dropped_before
+        seq = self._handed_over + self._arrivals.dropped_before
         self._handed_over += 1
         return seq
 

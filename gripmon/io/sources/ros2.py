@@ -14,7 +14,7 @@ from gripmon.io.sources.base import SourceError
 from gripmon.io.sources.camera_info import is_rectified, lens_fault, lens_of
 from gripmon.io.sources.network import Arrival, ArrivingCamera, Content, SilentAfter, largest_bytes_of
 from gripmon.io.sources.payload import PayloadError, file_image, message_image
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.camera import Camera
 from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG, PNG
