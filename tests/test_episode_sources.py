@@ -131,6 +131,12 @@ def test_file_that_is_no_mcap(tmp_path: Path):
         open_source(BagSettings(path=str(tmp_path / "a.mcap")))
 
 
+def change(file: Path) -> None:
+    """As one that was written again in the same size."""
+    stat = file.stat()
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns + NS))
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_an_episode_changes_with_its_own_files_and_its_place_alone(tmp_path: Path, version: str):
     """What was measured of it stands until then, also while others are recorded."""
@@ -146,10 +152,17 @@ def test_an_episode_changes_with_its_own_files_and_its_place_alone(tmp_path: Pat
     assert len(set(before)) == 3 and versions() == before
     changed = []
     for file in (sorted(root.glob("data/*/*.parquet"))[1], sorted(root.glob("videos/**/*.mp4"))[2]):
-        stat = file.stat()
-        os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns + NS))
+        change(file)
         changed.append([new != old for new, old in zip(versions(), before, strict=True)])
     assert changed == [[False, True, False], [False, True, True]]
+    (root / "videos").rename(tmp_path / "elsewhere")  # as where a cache holds the files
+    (root / "videos").symlink_to(tmp_path / "elsewhere")
+    table = sorted(root.glob("data/*/*.parquet"))[0]
+    table.symlink_to(table.rename(tmp_path / "table"))
+    before = versions()
+    for file in (table.resolve(), sorted((tmp_path / "elsewhere").glob("**/*.mp4"))[1]):
+        change(file)
+    assert [new != old for new, old in zip(versions(), before, strict=True)] == [True, True, False]
     before = versions()
     more = tmp_path / "more"
     write_lerobot(more, [*made, shots(2, first=30)], fps=10, version=version, per_file=1, codec="libx264")

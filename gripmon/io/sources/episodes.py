@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import posixpath
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -118,8 +120,9 @@ def _of_lerobot(path: str, name: str, cameras: Sequence[str], files: dict[str, d
 
     def version(number: int, camera: str) -> str:
         """Of what the episode is made of: others may come to the dataset meanwhile."""
-        own = [files.get(file[len(path) + 1 :], {}) for file in dataset.files(number, camera)]
-        return hash_of([dataset.description, dataset.episodes[number], _version(own)])
+        own = dataset.files(number, camera)
+        found = [files.get(file[len(path) + 1 :], {"name": file, "islink": True}) for file in own]
+        return hash_of([dataset.description, dataset.episodes[number], _version(found)])
 
     return [
         Episode(
@@ -131,7 +134,18 @@ def _of_lerobot(path: str, name: str, cameras: Sequence[str], files: dict[str, d
 
 
 def _version(files: Sequence[dict[str, Any]]) -> str:
-    return hash_of([[one.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")] for one in files])
+    return hash_of([_facts(one) for one in files])
+
+
+def _facts(file: dict[str, Any]) -> list[Any]:
+    """What tells that a file changed, as its store lists it; a link to one, or what is behind a link to a folder, isn't
+    listed by what it leads to.
+    """
+    if file.get("islink"):
+        with contextlib.suppress(OSError):
+            there = Path(file["name"]).stat()
+            return [there.st_size, there.st_mtime_ns]
+    return [file.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")]
 
 
 def hash_of(value: Any) -> str:
