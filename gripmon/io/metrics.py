@@ -6,6 +6,7 @@ Served by ``prometheus-client``, an optional dependency (``gripmon[metrics]``) t
 from __future__ import annotations
 
 import errno
+import functools
 import importlib.util
 from collections.abc import Callable, Iterator
 from operator import attrgetter
@@ -135,7 +136,7 @@ class MetricsServer(Output):
 
         families: dict[str, type[Any]] = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
         state, record = self._state, self._record
-        for metric in STATE_METRICS if state is not None else ():
+        for metric in state_metrics() if state is not None else ():
             family = families[metric.kind](metric.name, metric.help, labels=(*_WHO, *metric.labels))
             for values, number in metric.samples(state).items():
                 family.add_metric((*self._who, *values), number)
@@ -203,14 +204,15 @@ def _by_severity(state: StateRecord) -> dict[tuple[str, ...], float]:
     return {(severity.value,): float(found.count(severity)) for severity in Severity}
 
 
-STATE_METRICS = (
-    *filter(None, map(_metric_of, fields_of(StateRecord).values())),
-    StateMetric(
+@functools.cache
+def state_metrics() -> tuple[StateMetric, ...]:
+    """A metric for each field of the state message that can be one."""
+    info = StateMetric(
         "gripmon_info", "gauge", "always 1: the version and the reference", ("version", "reference"),
         lambda state: {(state.version, state.reference_id): 1.0},
-    ),
-)  # fmt: skip
-"""A metric for each field of the state message that can be one."""
+    )  # fmt: skip
+    return *filter(None, map(_metric_of, fields_of(StateRecord).values())), info
+
 
 OTHER_METRICS = {
     "gripmon_rotation_radians": ("gauge", (), "rotation of the camera from the reference"),

@@ -10,26 +10,15 @@ from typing import Any
 import msgspec
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from gripmon.model.outputs import Event, Notes, Trace
 from gripmon.model.records import Frame, FrameRecord, Limits
-from gripmon.record.columns import (
-    APPLICATION_ID,
-    AXIS,
-    EventWriter,
-    Palette,
-    Sender,
-    faded,
-    log_view,
-    plot,
-    two_columns,
-)
+from gripmon.record.columns import APPLICATION_ID, EventWriter, Palette, Sender, faded
 from gripmon.record.curves import CurveWriter
+from gripmon.record.layout import layout_file, layout_of_both
 from gripmon.record.pictures import Picture, Row, measured_picture
 from gripmon.record.read import RecordedFrames
 from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
-from gripmon.record.scene import layout_file, rig_view, wrist_image_view
 from gripmon.record.written_file import WrittenFile, open_stream
 
 RECORDED, REPLAYED = "recorded", "replayed"
@@ -58,8 +47,8 @@ class ComparedRecorder(Recorder):
         """
         path.unlink(missing_ok=True)
         self._source, self._recorded_limits = source, recorded_limits
-        stream = open_stream(scene)
-        self._file = WrittenFile(path, stream, scene, 1, layout_file(_layout(scene)), contextlib.nullcontext)
+        stream, layout = open_stream(scene), layout_of_both(scene, f"{RECORDED}/", REPLAYED, RECORDED)
+        self._file = WrittenFile(path, stream, scene, 1, layout_file(layout), contextlib.nullcontext)
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
         send = Sender(stream, f"{RECORDED}/")
         self._curves, self._status = CurveWriter(send, self._file.writer.corner_ids), EventWriter(send, RECORDED)
@@ -130,30 +119,6 @@ def _name_both(stream: rr.RecordingStream) -> None:
         ):
             pale = [faded(colour, alpha) for colour in colours]
             send.lines(path, [f"{whose} {name}" for name in names], pale, width)
-
-
-def _layout(scene: Scene) -> rrb.Blueprint:
-    """Left: the image with the replay's overlay, and the events of both runs.  Right: drifts and limits of both in one
-    plot, and the states of both.
-    """
-
-    def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
-        return plot("/", [f"{where}{path}" for where in (f"{RECORDED}/", "") for path in paths], name, legend=False)
-
-    drift = both(
-        ("drift/limits_mm", "drift/tcp_shift_mm"),
-        f"TCP drift (mm): x red, y green, z blue, length white; wide, pale: {RECORDED}, thin: {REPLAYED}",
-    )
-    turn = both(("drift/delta_deg", "drift/limits_deg"), "δ (°) and its limits, of both")
-    bounds = both(("protection/level_mm", "protection/limit_mm"), "Protection level (mm) and alert limit, of both")
-    states = [
-        rrb.StateTimelineView(origin=origin, name=f"State and verdict, {whose}", time_view=AXIS)
-        for origin, whose in ((f"{RECORDED}/status", RECORDED), ("status", REPLAYED))
-    ]
-    details = rrb.Tabs(rig_view(scene), turn, bounds, active_tab=0)
-    log = log_view("/", ["events", f"{RECORDED}/events"], f", {REPLAYED} and {RECORDED}")
-    judged = rrb.Vertical(drift, *states, details, row_shares=[4.5, 2, 2, 3])
-    return two_columns([wrist_image_view(scene), log], [6, 3], judged)
 
 
 def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:

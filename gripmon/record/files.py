@@ -169,12 +169,12 @@ class FileSeries(FileInbox):
 
     def _begin(self) -> None:
         """Begin the next file."""
-        from gripmon.record.scene import layout_file, make_blueprint
+        from gripmon.record.layout import layout_file, layout_of
         from gripmon.record.written_file import WrittenFile, open_stream
 
         self._stream = self._stream or open_stream(self._scene)
         if self._layout is None:
-            self._layout = layout_file(make_blueprint(self._scene))
+            self._layout = layout_file(layout_of(self._scene))
             with self._asking_disk():
                 self.notice = mend(self._budget)
         with self._asking_disk():

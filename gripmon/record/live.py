@@ -79,15 +79,14 @@ class LiveStream(LiveInbox):
     def _begin(self) -> RowWriter:
         import rerun as rr
 
-        from gripmon.record.columns import APPLICATION_ID
+        from gripmon.record.layout import layout_file, layout_of
         from gripmon.record.rows import RowWriter
-        from gripmon.record.scene import layout_file, make_blueprint
+        from gripmon.record.written_file import open_stream
 
-        if self._stream is None:
-            self._stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+        self._stream = self._stream or open_stream(self._scene)
         limit = f"{self._settings.memory_limit_bytes}B"
         self._stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
         self._stream.send_recording_name(f"{self._scene.name} (live)")
-        self._stream.log_file_from_contents("layout.rbl", layout_file(make_blueprint(self._scene)))
+        self._stream.log_file_from_contents("layout.rbl", layout_file(layout_of(self._scene)))
         self._repeat_at = 0.0
         return RowWriter(self._stream, self._scene, 0)

@@ -4,7 +4,7 @@ the code itself goes by.
 
 from __future__ import annotations
 
-from gripmon.io.metrics import OTHER_METRICS, STATE_METRICS
+from gripmon.io.metrics import OTHER_METRICS, state_metrics
 from gripmon.record.curves import curve_path
 from gripmon.record.parquet import SCHEMAS
 from gripmon.record.table import COLUMNS
@@ -47,7 +47,7 @@ def page() -> str:
 
 def metrics() -> list[tuple[str, str, tuple[str, ...], str]]:
     """Name as exposed, type, labels and meaning of each metric."""
-    found = [(m.name + "_total" * (m.kind == "counter"), m.kind, m.labels, m.help) for m in STATE_METRICS]
+    found = [(m.name + "_total" * (m.kind == "counter"), m.kind, m.labels, m.help) for m in state_metrics()]
     return found + [(name, kind, labels, text) for name, (kind, labels, text) in OTHER_METRICS.items()]
 
 
