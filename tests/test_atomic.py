@@ -20,8 +20,7 @@ OTHERWISE = {
     "daemon/starting.py",  # whether lines can be written there
     "cli/replay.py",
     "cli/common.py",
-    "record/compared.py",  # recordings: whether they can be written there; rerun writes them
-    "record/laser_scene.py",
+    "record/compared.py",  # a part that becomes the result
     "analyse/corrected.py",
     "daemon/simulated.py",  # folders that were empty before
     "simulate/sequence.py",

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 from support.loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
@@ -111,7 +112,8 @@ def test_in_a_forked_process_everything_says_so_and_nothing_hangs(
             signal.alarm(20)
             reading = client.latest()
             said = [reading.why, reading.reason, len(list(client)), client.closed, fleet.fault()]
-            for call in (client.state, client.alive, lambda: fleet.send(MonitorName("arm", "wrist"), CommandName.UNDO)):
+            undo = partial(fleet.send, MonitorName("arm", "wrist"), CommandName.UNDO)
+            for call in (client.state, client.alive, undo, fleet.monitors):
                 try:
                     call()
                 except NotCarriedOut as error:
@@ -125,7 +127,7 @@ def test_in_a_forked_process_everything_says_so_and_nothing_hangs(
         with os.fdopen(reads) as pipe:
             said = json.load(pipe)
     why = "this process was forked from the one that opened the client; open another one here"
-    assert said == [Unusable.CLOSED, why, 0, True, why, why, why, why]
+    assert said == [Unusable.CLOSED, why, 0, True, why, why, why, why, why]
     put_until(publisher, frame_record(2), lambda: client.latest().seq == 2 and client.latest().usable)
 
 

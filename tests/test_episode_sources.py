@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -14,6 +15,7 @@ from support.episode_files import NS, WRIST, Shots, write_foxglove, write_lerobo
 import gripmon
 from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, open_source, settings_for_path
 from gripmon.io.sources.bags import BagSource
+from gripmon.io.sources.episodes import find_episodes
 from gripmon.model.camera import BrownConradyLens
 from gripmon.model.jaw import JointOpening
 from gripmon.model.records import Frame
@@ -127,6 +129,47 @@ def test_file_that_is_no_mcap(tmp_path: Path):
     (tmp_path / "a.mcap").write_bytes(b"nothing of the kind")
     with pytest.raises(SourceError, match=r"a.mcap can't be read .*; a whole .mcap file"):
         open_source(BagSettings(path=str(tmp_path / "a.mcap")))
+
+
+def change(file: Path) -> None:
+    """As one that was written again in the same size."""
+    stat = file.stat()
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns + NS))
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_an_episode_changes_with_its_own_files_and_its_place_alone(tmp_path: Path, version: str):
+    """What was measured of it stands until then, also while others are recorded."""
+    root, made = tmp_path / "set", [shots(2, first=k) for k in (0, 10, 20)]
+
+    def versions(count: int = 3) -> list[str]:
+        found = find_episodes(str(root))
+        assert len(found) == count
+        return [episode.version for episode in found]
+
+    write_lerobot(root, made, fps=10, version=version, per_file=1, codec="libx264")
+    before = versions()
+    assert len(set(before)) == 3 and versions() == before
+    changed = []
+    for file in (sorted(root.glob("data/*/*.parquet"))[1], sorted(root.glob("videos/**/*.mp4"))[2]):
+        change(file)
+        changed.append([new != old for new, old in zip(versions(), before, strict=True)])
+    assert changed == [[False, True, False], [False, True, True]]
+    (root / "videos").rename(tmp_path / "elsewhere")  # as where a cache holds the files
+    (root / "videos").symlink_to(tmp_path / "elsewhere")
+    table = sorted(root.glob("data/*/*.parquet"))[0]
+    table.symlink_to(table.rename(tmp_path / "table"))
+    before = versions()
+    for file in (table.resolve(), sorted((tmp_path / "elsewhere").glob("**/*.mp4"))[1]):
+        change(file)
+    assert [new != old for new, old in zip(versions(), before, strict=True)] == [True, True, False]
+    before = versions()
+    more = tmp_path / "more"
+    write_lerobot(more, [*made, shots(2, first=30)], fps=10, version=version, per_file=1, codec="libx264")
+    for file in more.glob("meta/**/*"):
+        if file.is_file():
+            shutil.copyfile(file, root / file.relative_to(more))
+    assert versions(4)[:3] == before, "a fourth came"
 
 
 @pytest.mark.parametrize(("version", "codec"), [("v3.0", "libsvtav1"), ("v2.1", "libsvtav1"), ("v3.0", "libx264")])
@@ -245,8 +288,6 @@ def test_from_s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Over the protocol itself, from a server on this machine: what is listed is what is read."""
     import s3fs
     from moto.server import ThreadedMotoServer
-
-    from gripmon.io.sources.episodes import find_episodes
 
     server = ThreadedMotoServer("127.0.0.1", port=0)
     server.start()

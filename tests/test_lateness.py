@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gripmon.io.sources.network import MOST_LATE_S, WINDOW_S, Lateness, lasting_fault
+from gripmon.io.sources.lateness import MOST_LATE_S, WINDOW_S, Lateness, lasting_fault
 
 MS, S = 10**6, 10**9
 UNIX_NS = 1_700_000_000 * S

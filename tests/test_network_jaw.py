@@ -12,8 +12,8 @@ from support.loopback import free_endpoint, plain_session, wait_until
 
 from gripmon.io.jaw import MOST_REPORTS, ReportedOpening, StampedOpenings
 from gripmon.io.publish.inputs import ZenohJaw
-from gripmon.io.wire import Link, PublishSettings, link
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire import Link, PublishSettings, malformed
+from gripmon.io.wire.malformed import Malformed
 
 KEY = "gripmon/arm/wrist/jaw"
 TRAVEL_M = (0.0, 0.06)
@@ -143,7 +143,7 @@ def test_between_rare_reports_the_jaw_moves_at_the_end():
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now_s = [1000.0]
-    monkeypatch.setattr(link.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(malformed.time, "monotonic", lambda: now_s[0])
     return now_s
 
 
@@ -164,7 +164,7 @@ def test_what_is_malformed_is_said_once_an_occasion(clock: list[float], caplog: 
         "over 1,000 malformed frames on a/b: reason 1",
     ]
     assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (logged once)"]
-    clock[0] += link.REMEMBERED_S + 1.0
+    clock[0] += malformed.REMEMBERED_S + 1.0
     assert seen.fault() == ""
     seen.add("another reason")
     assert seen.fault() == "1 malformed frame on a/b: another reason"
@@ -180,20 +180,20 @@ def test_good_ones_for_some_seconds_end_the_words_but_not_the_count(
     for _ in range(20):
         seen.add("too short")
     for said in (True, True, False):
-        clock[0] += 0.4 * link.CALM_S
+        clock[0] += 0.4 * malformed.CALM_S
         seen.good()
         assert bool(seen.fault()) == said, "a few good ones aren't enough"
-    clock[0] += link.CALM_S
+    clock[0] += malformed.CALM_S
     assert seen.fault() == "" and seen.count == 20
     seen.add("too short")
     assert seen.fault() == "1 malformed frame on a/b: too short", "counted again after the calm"
-    clock[0] += 2.0 * link.CALM_S
+    clock[0] += 2.0 * malformed.CALM_S
     assert seen.fault(), "silence is no good sign"
     assert len(caplog.records) == 1, "one occasion, said once"
 
 
 def test_a_good_opening_is_told(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(link, "CALM_S", 0.0)
+    monkeypatch.setattr(malformed, "CALM_S", 0.0)
     with robot() as arm:
         arm.errs("34")
         assert arm.jaw.fault().startswith("no jaw opening received, 1 malformed jaw message on ")

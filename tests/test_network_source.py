@@ -27,8 +27,8 @@ from gripmon.io.sources import (
     Waiting,
     open_source,
 )
-from gripmon.io.sources.network import clock_fault
-from gripmon.io.wire import Keys, Link, PublishSettings, link
+from gripmon.io.sources.lateness import clock_fault
+from gripmon.io.wire import Keys, Link, PublishSettings, malformed
 from gripmon.model.records import Frame, Refusal
 
 KEY = "cell/camera"
@@ -152,7 +152,7 @@ def test_an_image_of_another_size_is_refused_as_that(driver: Driver):
 
 
 def test_good_frames_end_what_is_said_of_bad_ones(driver: Driver, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(link, "CALM_S", 0.0)
+    monkeypatch.setattr(malformed, "CALM_S", 0.0)
     driver.put(b"rubbish")
     assert frame_of(driver.camera).image is None
     assert driver.camera.fault().startswith("1 malformed frame on ")

@@ -29,9 +29,10 @@ def source_of(path: Path, change, written: Shots | None = None, **how) -> BagSou
     return BagSource(BagSettings(path=str(path / "a.mcap")))
 
 
-def lens_with(path: Path, **fields: object) -> LensSettings | None:
+def lens_with(path: Path, topic: str = "/wrist/image", **fields: object) -> LensSettings | None:
     """The lens of a recording whose CameraInfo has these fields."""
-    return source_of(path, lambda m: dataclasses.replace(m, **fields) if hasattr(m, "binning_x") else m).camera
+    change = lambda m: dataclasses.replace(m, **fields) if hasattr(m, "binning_x") else m  # noqa: E731
+    return source_of(path, change, topic=topic).camera
 
 
 @pytest.mark.parametrize(
@@ -58,6 +59,34 @@ def test_a_region_that_is_no_part_of_the_sensor_is_refused(tmp_path: Path):
     """Width and height are the image's here; whether K is the sensor's or the image's, nobody can tell."""
     with pytest.raises(SourceError, match=r"camera_info: roi: 64 x 48 px at 8, 6 isn't part of the 64 x 48 px that K"):
         lens_with(tmp_path, roi=REGION(8, 6, 48, 64, False))
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/wrist/image_rect", True),
+        ("/wrist/image_rect_color", True),
+        ("/wrist/color/image_rect_raw", True),
+        ("/wrist/rect/compressed", True),
+        ("/wrist/rectified", True),
+        ("/wrist/image_raw", False),
+        ("/wrist/direct/image", False),
+        ("/wrist/image_unrectified", False),
+        ("/rectangle/image", False),
+    ],
+)
+def test_images_that_are_rectified_have_the_camera_of_p(tmp_path: Path, topic: str, rectified: bool):
+    lens = lens_with(tmp_path, topic, p=np.array([70.0, 0, 30, 0, 0, 71, 23, 0, 0, 0, 1, 0]))
+    assert lens is not None
+    assert (lens.fx_px, any(lens.coefficients)) == ((70.0, False) if rectified else (LENS.fx_px, True))
+
+
+def test_rectified_images_without_p_have_no_known_camera(tmp_path: Path):
+    """K and D are of the image before it was rectified; without distortion it is the same."""
+    with pytest.raises(SourceError, match="P is empty, and D isn't; for rectified images P, the camera without dist"):
+        lens_with(tmp_path, "/wrist/image_rect")
+    lens = lens_with(tmp_path, "/wrist/image_rect", d=np.zeros(5))
+    assert lens is not None and (lens.fx_px, any(lens.coefficients)) == (LENS.fx_px, False)
 
 
 def test_a_lens_that_cannot_be_used_is_fatal_to_nobody_who_brings_his_own(tmp_path: Path, capfd):

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from functools import partial
-from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,17 +18,14 @@ import psutil
 import pytest
 from support.loopback import alert_record
 from support.recorded import (
-    CAMERA,
-    GRIPPER,
     INTERVAL_NS,
-    REFERENCE,
     START_NS,
     Recorded,
     frame,
     image,
     record,
     recorder,
-    settings,
+    scene,
     trace,
     wait_until,
 )
@@ -39,13 +35,12 @@ from gripmon.model.records import ReferenceRecord
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
 from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events, make_scene
+from gripmon.record.recorder import Events
 from gripmon.record.write import ProcessRecorder
 
 
 @pytest.fixture(autouse=True)
 def no_child_left() -> Iterator[None]:
-    resource_tracker.ensure_running()  # multiprocessing's own, which stays
     before = set(psutil.Process().children())
     yield
     # One that has all it needs may write on for a while.
@@ -176,7 +171,7 @@ def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(
         return sent
 
     monkeypatch.setattr(os, "sendfile", sendfile)
-    files = FileSeries(make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    files = FileSeries(scene(tmp_path))
 
     def write(first: int) -> None:
         files.add_frames([Row(record(i), None, None, None) for i in range(first, first + 10)])
@@ -223,8 +218,7 @@ def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monk
     free = [2_000_000_000]
     monkeypatch.setattr("gripmon.record.keeping.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
     monkeypatch.setattr("gripmon.record.files._FIRST_RETRY_S", 0.0)
-    keeping = settings(min_free_bytes=1_000_000_000)
-    files = FileSeries(make_scene(keeping, str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    files = FileSeries(scene(tmp_path, min_free_bytes=1_000_000_000))
     files.add_frames([Row(record(0), None, None, None)])
     files.write()
     assert (files.frames_written, files.failure) == (1, None)

@@ -11,11 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from support.recorded import (
-    CAMERA,
     GRIPPER,
     INTERVAL_NS,
     OVERLAY,
-    REFERENCE,
     START_NS,
     Recorded,
     decoded,
@@ -23,7 +21,7 @@ from support.recorded import (
     image,
     record,
     recorder,
-    settings,
+    scene,
     trace,
     wait_until,
 )
@@ -32,7 +30,7 @@ from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cau
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import Moments, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
 from gripmon.record.pictures import Picture, PictureRing, Row
-from gripmon.record.recorder import RecordingSettings, make_scene
+from gripmon.record.recorder import RecordingSettings
 from gripmon.record.write import ProcessRecorder
 
 BUMP = Alert(
@@ -163,8 +161,7 @@ def test_what_pins() -> None:
 
 
 def series(directory: Path, name: str = "run", **changes: Any) -> FileSeries:
-    chosen = settings(**{"around_alert_s": 0.0, "max_file_bytes": 150_000, **changes})
-    made = FileSeries(make_scene(chosen, str(directory), name, "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    made = FileSeries(scene(directory, name, **{"around_alert_s": 0.0, "max_file_bytes": 150_000, **changes}))
     made.write()  # begins the first file
     return made
 

@@ -17,14 +17,13 @@ from pathlib import Path
 
 import psutil
 import pytest
-from support.recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
+from support.recorded import Recorded, frame, record, recorder, scene, wait_until
 
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import repair
 from gripmon.record.pictures import Row
 from gripmon.record.read import open_recordings
-from gripmon.record.recorder import make_scene
 
 HERE = Path(__file__).parent
 MOST_LOST_S = 2.0
@@ -95,7 +94,7 @@ def test_killed_at_a_random_moment(tmp_path: Path, attempt: int) -> None:
     # Our own reader takes it as it was left, rerun's after the start of the next recording.
     (run,) = open_recordings([path]).recordings
     ours = run.frames.seq.tolist()
-    series = FileSeries(make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    series = FileSeries(scene(tmp_path))
     series.write()
     series.close()
     assert rows_of(path) == ours == list(range(len(ours)))
@@ -107,7 +106,7 @@ def test_killed_at_a_random_moment(tmp_path: Path, attempt: int) -> None:
 
 
 def test_a_file_cut_anywhere_is_whole_after_the_next_start(tmp_path: Path) -> None:
-    made = FileSeries(make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    made = FileSeries(scene(tmp_path))
     for i in range(12):
         made.add_frames([Row(record(i), None, None, None)])
         made.write()

@@ -12,15 +12,12 @@ import pytest
 import yaml
 from support.gripmon_process import gripmon
 from support.recorded import (
-    CAMERA,
-    GRIPPER,
-    REFERENCE,
     Recorded,
     frame,
     image,
     record,
     recorder,
-    settings,
+    scene,
     trace,
     wait_until,
 )
@@ -30,7 +27,7 @@ from gripmon.model.records import Alert, AlertKind, Cause, Severity
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.process import Worker
 from gripmon.record.read import open_recordings
-from gripmon.record.recorder import Status, make_scene
+from gripmon.record.recorder import Status
 from gripmon.record.write import ProcessRecorder
 
 DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
@@ -108,14 +105,13 @@ def test_whoever_can_wait_gets_all_images_around_an_alert(tmp_path: Path) -> Non
 
 def test_a_process_that_ends_while_it_is_written_to_still_says_why(tmp_path: Path) -> None:
     """The pipe towards it may break before its last report is read."""
-    scene = make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
     images = SharedImages(1, 64, 48)
-    worker = Worker(scene, images)
+    worker = Worker(scene(tmp_path), images)
     wait_until(lambda: worker.look() or worker.status.path is not None)
     path, worker.status = worker.status.path, Status()
     wait_until(worker._reports.poll)  # one more, which nobody has read
     worker.kill()
-    worker._process.join(60.0)
+    assert worker._process.ended_within(60.0)
     worker.send(b"more")
     assert worker.gone and worker.status.path == path, "its reports were read"
     assert worker.reap() == "the recording process ended with code -9"

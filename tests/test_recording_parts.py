@@ -10,8 +10,8 @@ from support.recorded import HEIGHT_PX, WIDTH_PX
 from gripmon.model.records import State, Verdict
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.columns import Palette
+from gripmon.record.overlay import _label_places
 from gripmon.record.recorder import to_8_bit
-from gripmon.record.scene import _label_places
 
 
 def test_shared_images_keep_apart() -> None:
@@ -26,6 +26,17 @@ def test_shared_images_keep_apart() -> None:
     for note, picture in zip(notes, pictures, strict=True):
         assert ring.takes(picture)
         np.testing.assert_array_equal(ring.get(note), picture)
+    ring.close()
+
+
+def test_an_image_that_another_one_took_the_place_of_is_none() -> None:
+    ring = SharedImages(2, WIDTH_PX, HEIGHT_PX)
+    first, second, third = (np.full((HEIGHT_PX, WIDTH_PX), grey, np.uint8) for grey in (1, 2, 3))
+    one, two = ring.put(0, first), ring.put(1, second)
+    kept = ring.copy(one)
+    ring.put(2, third)
+    assert kept is not None and (kept == first).all(), "a copy stays what it was"
+    assert ring.copy(one) is None and (ring.copy(two) == second).all()
     ring.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -180,7 +179,7 @@ def test_nobody_reads_for_long_and_the_renderer_goes_on(cameras: list[SimulatedC
 def test_a_maker_that_can_make_nothing_is_refused_at_the_start():
     with pytest.raises(SourceError, match=r"scenario: can't be rendered \(ArithmeticError: no picture 0\)"):
         counting_camera(fails_at=0)
-    assert not [p for p in multiprocessing.active_children() if p.name.startswith("gripmon-simulator")]
+    assert not psutil.Process().children()
 
 
 def test_a_failure_later_surfaces_in_the_reader(cameras: list[SimulatedCamera]):
@@ -216,16 +215,15 @@ CHILD_SCRIPT = """
 import signal, sys, time
 sys.path.insert(0, {tests!r})
 from test_simulated_sources import counting_camera, frames_of
-if __name__ == "__main__":
-    hits = []
-    signal.signal(signal.SIGINT, lambda *_: hits.append(1))
-    camera = counting_camera(processes=2)
-    print(*camera.pids, flush=True)
-    while not hits:
-        frames_of(camera, 1)
-    frames_of(camera, 5)
-    camera.close()
-    print("closed", flush=True)
+hits = []
+signal.signal(signal.SIGINT, lambda *_: hits.append(1))
+camera = counting_camera(processes=2)
+print(*camera.pids, flush=True)
+while not hits:
+    frames_of(camera, 1)
+frames_of(camera, 5)
+camera.close()
+print("closed", flush=True)
 """
 
 

@@ -7,6 +7,7 @@ import re
 import signal
 import socket
 import subprocess
+import threading
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
@@ -26,6 +27,9 @@ from support.loopback import WAIT_S, free_endpoint, wait_until
 from support.network_daemon import ENVIRONMENT
 
 from gripmon.daemon.config import builtin_config
+from gripmon.record.files import FileSeries
+from gripmon.record.live import LiveStream
+from gripmon.record.pictures import Picture, Row
 from gripmon.record.recorder import RecordingSettings, ViewSettings
 from gripmon.record.write import ProcessRecorder, open_recorder
 
@@ -133,6 +137,46 @@ def test_a_live_view_that_cannot_be_served_costs_nothing_else(tmp_path: Path, ca
         recorder.close(timeout_s=60.0)
     (file,) = tmp_path.glob("live-*.rrd")
     assert seqs_of(file) == set(range(20)) and recorder.dropped == 0
+
+
+def test_a_viewer_that_stalls_holds_up_no_file(tmp_path: Path):
+    """Its server waits for it; files are begun and ended in the same process, one after another."""
+    view = ViewSettings(port=free_port(), web_port=free_port(), memory_limit_bytes=10_000_000)
+    scene = recorded.scene(tmp_path, max_file_bytes=200_000)
+    live, files = LiveStream(scene, view), FileSeries(scene)
+    noise = np.random.default_rng(1).bytes(2_000_000)
+
+    def row(seq: int, size: int) -> Row:
+        picture = Picture(noise[:size], "image/png", 0.0, 0.0, 0.0, 0.0)
+        return Row(recorded.record(seq), picture, None, None)
+
+    def serve(seq: int, size: int) -> None:
+        live.add_frames([row(seq, size)])
+        live.write()
+
+    def write() -> None:
+        for seq in range(12):
+            files.add_frames([row(seq, 90_000)])
+            files.write()
+        files.close()
+
+    serve(0, 1000)
+    with receiver(view, tmp_path / "seen.rrd") as viewer:
+        wait_until(lambda: serve(1, 1000) or seqs_of(tmp_path / "seen.rrd"), "it is shown")
+        viewer.send_signal(signal.SIGSTOP)
+        for seq in range(2, 500):
+            if live._stalled:
+                break
+            serve(seq, len(noise))
+        assert live._stalled, "the server waits"
+        writing = threading.Thread(target=write, daemon=True)
+        writing.start()
+        writing.join(10.0)  # without what the server holds up it takes a fraction of a second
+        assert not writing.is_alive() and live._stalled
+    live.close()
+    assert (files.failure, files.frames_written) == (None, 12)
+    written = sorted(tmp_path.glob("run-*.rrd"))
+    assert len(written) > 3 and set().union(*map(seqs_of, written)) == set(range(12))
 
 
 @pytest.fixture(scope="module")

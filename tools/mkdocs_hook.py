@@ -8,13 +8,14 @@ from typing import Any
 
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
-from pages import api, commands, configuration, examples, messages, rooms
+from pages import api, commands, configuration, examples, fields, messages, rooms
 
 GENERATED = {
     "tutorials/examples.md": examples.page,
     "reference/cli.md": commands.page,
     "reference/configuration.md": configuration.page,
     "reference/api.md": api.page,
+    "reference/fields.md": fields.page,
 }
 _FILLED = {
     "reference/wire.md": messages.put_into,

@@ -19,9 +19,9 @@ import zenoh.ext
 
 from gripmon.client.age import steady_s
 from gripmon.client.commands import ask
-from gripmon.client.network import Joined, MonitorName, monitor_name, start_of
+from gripmon.client.network import FORKED, Joined, MonitorName, NotCarriedOut, monitor_name, start_of
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, in_zenohs_thread
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.records import (
     AlertRecord,
     CommandName,
@@ -167,7 +167,12 @@ class Fleet(Joined):
         return self._malformed.count
 
     def monitors(self) -> list[MonitorStatus]:
-        """All monitors seen since the start, unordered; each of several present under one name."""
+        """All monitors seen since the start, unordered; each of several present under one name.
+
+        Raises :class:`NotCarriedOut` in a process that was forked since: nothing is heard there.
+        """
+        if self.forked:
+            raise NotCarriedOut(FORKED)
         now_s = steady_s()
         with self._lock:
             return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
@@ -186,10 +191,6 @@ class Fleet(Joined):
         """
         request = CommandRequest(argument, uuid.uuid4().hex, monitor_id)
         return ask(self, Keys(*monitor), request, name, timeout_s)
-
-    def _after_fork(self) -> None:
-        super()._after_fork()
-        self._lock = threading.Lock()
 
     def _declare(self, session: zenoh.Session) -> Sequence[object]:
         keys, tokens = Keys("*", "*"), session.liveliness()

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from gripmon.client.age import NO_LEADS, Leads, Sent, steady_s, waited_s, with_answer, without_contradicted
 from gripmon.client.network import MonitorName, Start
-from gripmon.io.wire.link import REMEMBERED_S, Malformed
+from gripmon.io.wire.malformed import REMEMBERED_S, Malformed
 from gripmon.model.records import ClockReading, FrameRecord, MessageRefused, Verdict, from_json
 
 _log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.keeping import keep_whole
 from gripmon.record.read import RecordedFrames, recording_files
-from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, make_scene
+from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, Scene
 from gripmon.record.write import open_recorder
 
 if TYPE_CHECKING:
@@ -85,9 +85,10 @@ class RecordedRun:
             reference = self.state.references[-1]
         part = path.with_name(f".{path.name}.part")
         settings = config.settings
-        scene = make_scene(
-            settings.recording, str(path.parent), path.stem, settings.robot, settings.camera_name, config.camera,
-            config.gripper, reference, configuration=to_recorded(config, self.state),
+        scene = Scene(
+            name=path.stem, directory=str(path.parent), settings=settings.recording, robot=settings.robot,
+            camera=settings.camera_name, lens=config.camera.settings, gripper=config.gripper.model, reference=reference,
+            configuration=to_recorded(config, self.state),
         )  # fmt: skip
         try:
             recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))

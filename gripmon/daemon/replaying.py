@@ -14,9 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.sighting import CalibrationError
-from gripmon.calibrate.verify import NEGLIGIBLE_PX, compare_cameras
 from gripmon.daemon.api import Monitor, open_source
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.checks import reference_doubt
@@ -33,8 +30,8 @@ from gripmon.io.sources import (
     settings_for_path,
 )
 from gripmon.io.sources import open_source as start
+from gripmon.io.sources.camera_info import lens_fault
 from gripmon.io.sources.files import TIMESTAMPS_NAME
-from gripmon.model.camera import LensSettings
 from gripmon.model.coverage import too_few
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.images import IMAGE_SUFFIXES
@@ -300,7 +297,7 @@ def _open_input(
     except SourceError as error:  # fatal to nobody who brings his own
         warn(f"the frames' own camera calibration can't be used ({error}); the configuration's is used")
         return source
-    if config is not None and lens is not None and (off := lens_fault(lens, config)) is not None:
+    if config is not None and lens is not None and (off := lens_fault(lens, config.settings.camera)) is not None:
         warn(off)
     return source
 
@@ -321,15 +318,3 @@ def as_configured(
     number = known_set.episode if episode is None else episode
     chosen = camera or known_set.camera
     return LeRobotSettings(path=settings.path, camera=chosen, episode=number, opening=known_set.opening)
-
-
-def lens_fault(lens: LensSettings, config: Config) -> str | None:
-    """How the camera calibration in the input differs from the configuration's, in words; None: it doesn't."""
-    try:
-        off = compare_cameras(GivenCamera(config.settings.camera, (), None), GivenCamera(lens, (), None))
-    except CalibrationError as error:
-        return f"the frames have a camera calibration of another kind ({error}); the configuration's is used"
-    if off.largest_px <= NEGLIGIBLE_PX:
-        return None
-    far = f"up to {off.largest_px:.3g} px from the configuration's"
-    return f"the frames have a camera calibration that is {far}, which is used"

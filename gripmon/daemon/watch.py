@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from gripmon.io.wire.link import FIGURES
+from gripmon.io.wire.malformed import FIGURES
 from gripmon.judge.policy import AlertBook
 from gripmon.model.records import (
     Alert,

@@ -6,14 +6,18 @@ Served by ``prometheus-client``, an optional dependency (``gripmon[metrics]``) t
 from __future__ import annotations
 
 import errno
+import functools
 import importlib.util
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from collections.abc import Callable, Iterator
+from operator import attrgetter
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import msgspec
+import msgspec.inspect as kinds
 from msgspec import Meta
 
 from gripmon.model.errors import InputError
+from gripmon.model.fields import Field, fields_of
 from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import (
     AlertEvent,
@@ -21,9 +25,7 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Severity,
-    State,
     StateRecord,
-    ValidBy,
     Verdict,
 )
 
@@ -86,14 +88,15 @@ class MetricsServer(Output):
         who = self._who = (robot, camera)
         self._state: StateRecord | None = None
         self._record: FrameRecord | None = None
-        text = "Time from a frame's arrival at the machine to its verdict"
-        self._latency = prometheus.Histogram(
-            "gripmon_latency_seconds", text, _WHO, buckets=LATENCY_BOUNDS_S, registry=registry
-        ).labels(*who)
-        verdicts = prometheus.Counter("gripmon_verdicts", "Frames by verdict", (*_WHO, "verdict"), registry=registry)
+
+        def made(kind: type[Any], name: str, **more: Any) -> Any:
+            _, labels, text = OTHER_METRICS[name]
+            return kind(name, text, (*_WHO, *labels), registry=registry, **more)
+
+        self._latency = made(prometheus.Histogram, "gripmon_latency_seconds", buckets=LATENCY_BOUNDS_S).labels(*who)
+        verdicts = made(prometheus.Counter, "gripmon_verdicts_total")
         self._verdicts = {verdict: verdicts.labels(*who, verdict.value) for verdict in Verdict}
-        labels = (*_WHO, "kind", "cause", "severity")
-        self._alerts = prometheus.Counter("gripmon_alerts", "Alerts raised or noted", labels, registry=registry)
+        self._alerts = made(prometheus.Counter, "gripmon_alerts_total")
         prometheus.ProcessCollector(registry=registry)
         registry.register(self)
         try:
@@ -131,92 +134,95 @@ class MetricsServer(Output):
         """For ``prometheus_client``: what isn't counted frame by frame, from the newest state and frame."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        def family(kind: type[Any], name: str, text: str, samples: Mapping[str, float], *labels: str) -> Metric:
-            made = kind(name, text, labels=(*_WHO, *labels))
-            for value, number in samples.items():
-                made.add_metric((*self._who, *([value] if labels else ())), number)
-            return made
-
+        families: dict[str, type[Any]] = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
         state, record = self._state, self._record
-        if state is not None:
-            for name, (text, count) in _counts(state).items():
-                yield family(CounterMetricFamily, name, text, {} if count is None else {"": count})
-            for name, (text, value) in _values(state).items():
-                yield family(GaugeMetricFamily, name, text, {} if value is None else {"": value})
-            for name, (text, label, samples) in _by_label(state).items():
-                yield family(GaugeMetricFamily, name, text, samples, label)
-            info = GaugeMetricFamily(
-                "gripmon_info", "Always 1: the version and the reference", labels=(*_WHO, "version", "reference")
-            )
-            info.add_metric((*self._who, state.version, state.reference_id), 1.0)
-            yield info
-        turn = {}
+        for metric in state_metrics() if state is not None else ():
+            family = families[metric.kind](metric.name, metric.help, labels=(*_WHO, *metric.labels))
+            for values, number in metric.samples(state).items():
+                family.add_metric((*self._who, *values), number)
+            yield family
+        turn = GaugeMetricFamily("gripmon_rotation_radians", OTHER_METRICS["gripmon_rotation_radians"][2], labels=_WHO)
         if record is not None and record.verdict is not Verdict.UNKNOWN and record.drift is not None:
-            turn = {"": record.drift.rotation_rad}
-        yield family(GaugeMetricFamily, "gripmon_rotation_radians", "Rotation of the camera from the reference", turn)
+            turn.add_metric(self._who, record.drift.rotation_rad)
+        yield turn
 
 
-def _counts(state: StateRecord) -> dict[str, tuple[str, int | None]]:
-    return {
-        "gripmon_frames": ("Frames processed", state.frames),
-        "gripmon_frames_refused": ("Frames that could not be measured at all", state.frames_refused),
-        "gripmon_frames_dropped": (
-            "Frames dropped because another one was being processed",
-            state.frames_dropped,
-        ),
-        "gripmon_recording_dropped": ("Frames missing in the recording", state.recording_dropped),
-        "gripmon_recording_images_dropped": ("Images missing in the recording", state.recording_images_dropped),
-        "gripmon_transforms_unsent": (
-            "Transforms not sent because there was no session yet",
-            state.transforms_unsent,
-        ),
-        "gripmon_messages_malformed": ("Malformed messages received", state.malformed),
-    }
+class StateMetric(NamedTuple):
+    """A metric of the state message: its samples by the values of ``labels``, none where the value is unknown.
+
+    A counter is exposed with ``_total`` behind its name.
+    """
+
+    name: str
+    kind: Literal["counter", "gauge"]
+    help: str
+    labels: tuple[str, ...]
+    samples: Callable[[Any], dict[tuple[str, ...], float]]
 
 
-def _values(state: StateRecord) -> dict[str, tuple[str, float | None]]:
-    return {
-        "gripmon_frames_per_second": ("Recent frame rate; 0 without frames", state.frames_per_s),
-        "gripmon_uptime_seconds": ("Time since the monitor's start", state.uptime_s),
-        "gripmon_camera_connected": ("1 while the source is open", float(state.camera_connected)),
-        "gripmon_reference_revision": ("Revision of the reference in force", state.revision),
-        "gripmon_state_timestamp_seconds": ("Time of the last state message, Unix time", 1e-9 * state.stamp_ns),
-        "gripmon_sigma_meters": ("Largest standard deviation of the TCP along a camera axis", state.sigma_m),
-        "gripmon_protection_meters": ("Bound on the TCP's position error", state.protection_m),
-        "gripmon_alert_limit_meters": ("Position error of the TCP that the task tolerates", state.alert_limit_m),
-    }
+_SPELLED = {
+    "m": ("_meters", 1.0), "rad": ("_radians", 1.0), "s": ("_seconds", 1.0), "1/s": ("_per_second", 1.0),
+    "ns": ("_seconds", 1e-9),
+}  # fmt: skip
+"""Units in names by Prometheus's conventions, and what a value in ours is multiplied by."""
+_RENAMED = {"revision": "reference_revision", "malformed": "messages_malformed", "stamp": "state_timestamp"}
+_GAUGES = ("revision", "stamp_ns")  # whole numbers that aren't counts
+_NO_METRIC = ("seq",)
 
 
-def _by_label(state: StateRecord) -> dict[str, tuple[str, str, dict[str, float]]]:
-    severities = [alert.severity for alert in state.open_alerts]
-    return {
-        "gripmon_valid_by": (
-            "1 for the error that protection bounds: absolute, or reference, of the motion since the reference",
-            "valid_by",
-            {} if state.valid_by is None else {each.value: float(each is state.valid_by) for each in ValidBy},
-        ),
-        "gripmon_tcp_shift_meters": (
-            "Displacement of the TCP from the reference, along the camera's axes",
-            "axis",
-            dict(zip("xyz", state.tcp_shift_m or (), strict=False)),
-        ),
-        # One sample per state, 1 for the current one, even if this version doesn't know that state's name.
-        "gripmon_state": (
-            "1 for the monitor's current state",
-            "state",
-            {each.value: 0.0 for each in State} | {str(state.state): 1.0},
-        ),
-        "gripmon_verdict": (
-            "1 for the last transform's verdict",
-            "verdict",
-            {each.value: 0.0 for each in Verdict} | {str(state.verdict): 1.0},
-        ),
-        "gripmon_open_alerts": (
-            "Alerts raised and not cleared",
-            "severity",
-            {severity.value: float(severities.count(severity)) for severity in Severity},
-        ),
-    }
+def _metric_of(field: Field) -> StateMetric | None:
+    """Counts are counters, names have a sample for each possible one, texts are no metrics."""
+    value, kind = attrgetter(field.name), field.type
+    spelled, scale = _SPELLED.get(field.unit, ("", 1.0))
+    name = f"gripmon_{_RENAMED.get(field.stem, field.stem)}{spelled}"
+    text = field.help.partition("; null")[0].rstrip(".").replace("Unix ns", "Unix").removesuffix(f", {field.unit}")
+    if field.name == "open_alerts":
+        return StateMetric(name, "gauge", text, ("severity",), _by_severity)
+    if isinstance(kind, kinds.EnumType):
+        # One sample per name, 1 for the current one, even if this version doesn't know it.
+        none: dict[tuple[str, ...], float] = {(str(each.value),): 0.0 for each in kind.cls}
+        return StateMetric(name, "gauge", f"{text}: 1, 0 for the others", (field.name,), lambda state: (
+            {} if value(state) is None else none | {(str(value(state)),): 1.0}
+        ))  # fmt: skip
+    if isinstance(kind, kinds.TupleType):
+        return StateMetric(name, "gauge", text, ("axis",), lambda state: (
+            dict(zip(_AXES, value(state) or (), strict=False))
+        ))  # fmt: skip
+    if not isinstance(kind, kinds.IntType | kinds.FloatType | kinds.BoolType) or field.name in _NO_METRIC:
+        return None
+    counts = isinstance(kind, kinds.IntType) and field.name not in _GAUGES
+    return StateMetric(name, "counter" if counts else "gauge", text, (), lambda state: (
+        {} if value(state) is None else {(): scale * value(state)}
+    ))  # fmt: skip
+
+
+_AXES = (("x",), ("y",), ("z",))
+
+
+def _by_severity(state: StateRecord) -> dict[tuple[str, ...], float]:
+    found = [alert.severity for alert in state.open_alerts]
+    return {(severity.value,): float(found.count(severity)) for severity in Severity}
+
+
+@functools.cache
+def state_metrics() -> tuple[StateMetric, ...]:
+    """A metric for each field of the state message that can be one."""
+    info = StateMetric(
+        "gripmon_info", "gauge", "always 1: the version and the reference", ("version", "reference"),
+        lambda state: {(state.version, state.reference_id): 1.0},
+    )  # fmt: skip
+    return *filter(None, map(_metric_of, fields_of(StateRecord).values())), info
+
+
+OTHER_METRICS = {
+    "gripmon_rotation_radians": ("gauge", (), "rotation of the camera from the reference"),
+    "gripmon_verdicts_total": ("counter", ("verdict",), "frames by verdict"),
+    "gripmon_latency_seconds": ("histogram", (), "time from a frame's arrival at the machine to its verdict"),
+    "gripmon_alerts_total": (
+        "counter", ("kind", "cause", "severity"), "alerts raised or noted; no sample before the first of its kind",
+    ),
+}  # fmt: skip
+"""Of the frames and alerts themselves: kind, labels, help."""
 
 
 def _remedy(error: Exception) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""What all recordings share: rows, columns in a stream, colours, parts of a layout, and events beside the frames."""
+"""What all recordings share: columns in a stream, colours, and events beside the frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from gripmon.model.camera import LensSettings
 from gripmon.model.records import (
@@ -24,7 +23,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events, Scene
+from gripmon.record.recorder import Events
 
 APPLICATION_ID = "gripmon"
 _CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame
@@ -74,14 +73,14 @@ def faded(colour: Colour, alpha: int) -> Colour:
 
 
 class Sender:
-    """Sends columns with both timelines."""
+    """Sends columns with both timelines, to entities below ``root`` ("recorded/")."""
 
-    def __init__(self, stream: rr.RecordingStream):
-        self.stream = stream
+    def __init__(self, stream: rr.RecordingStream, root: str = ""):
+        self._stream, self._root = stream, root
 
     def static(self, path: str, *archetypes: rr.AsComponents) -> None:
         for archetype in archetypes:
-            self.stream.log(path, archetype, static=True)
+            self._stream.log(f"{self._root}{path}", archetype, static=True)
 
     def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
         """Send columns; without stamps on the frame timeline only."""
@@ -89,7 +88,7 @@ class Sender:
         if stamps_ns:
             times = np.array(stamps_ns, np.int64).astype("datetime64[ns]")
             indexes.insert(0, rr.TimeColumn("capture_time", timestamp=times))
-        self.stream.send_columns(path, indexes, columns)
+        self._stream.send_columns(f"{self._root}{path}", indexes, columns)
 
     def frames(self, path: str, rows: Sequence[Row], columns: rr.ComponentColumnList) -> None:
         self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)
@@ -229,39 +228,3 @@ def pinhole(lens: LensSettings, image_plane_m: float, **looks: Any) -> rr.Pinhol
         principal_point=[lens.cx_px, lens.cy_px], camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=image_plane_m, **looks,
     )  # fmt: skip
-
-
-AXIS = rrb.TimeAxis(link="LinkToGlobal")
-
-
-def plot(
-    origin: str, contents: str | list[str], name: str, *, legend: bool = True, shown: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    """Curves over the shared time axis; ``shown`` is the range of values, None: automatic."""
-    return rrb.TimeSeriesView(
-        origin=origin, contents=contents, name=name, axis_x=AXIS,
-        axis_y=None if shown is None else rrb.ScalarAxis(range=shown),
-        plot_legend=None if legend else rrb.PlotLegend(visible=False),
-    )  # fmt: skip
-
-
-def image_view(scene: Scene, origin: str, image: str, legend: str) -> rrb.Spatial2DView:
-    """The image with its overlay."""
-    lens = scene.lens
-    bounds = rrb.VisualBounds2D(x_range=[-0.5, lens.width_px - 0.5], y_range=[-0.5, lens.height_px - 0.5])
-    name = f"{scene.robot} / {scene.camera} ({legend})"
-    return rrb.Spatial2DView(origin=origin, contents=f"{image}/**", name=name, visual_bounds=bounds)
-
-
-def log_view(origin: str = "events", contents: str | list[str] = "$origin/**", whose: str = "") -> rrb.TextLogView:
-    columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
-    return rrb.TextLogView(origin=origin, contents=contents, name=f"Alerts and changes{whose}", columns=columns)
-
-
-def two_columns(left: list[rrb.View], left_shares: list[float], right: rrb.Container) -> rrb.Blueprint:
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*left, row_shares=left_shares), right, column_shares=[5, 4]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="capture_time"),
-    )

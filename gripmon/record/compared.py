@@ -2,58 +2,34 @@
 
 from __future__ import annotations
 
-import shutil
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
-from gripmon.model.errors import one_line
 from gripmon.model.outputs import Event, Notes, Trace
 from gripmon.model.records import Frame, FrameRecord, Limits
-from gripmon.record.columns import (
-    APPLICATION_ID,
-    AXIS,
-    EventWriter,
-    Palette,
-    Sender,
-    faded,
-    log_view,
-    plot,
-    two_columns,
-)
+from gripmon.record.columns import APPLICATION_ID, EventWriter, Palette, Sender, faded
 from gripmon.record.curves import CurveWriter
+from gripmon.record.layout import layout_file, layout_of_both
 from gripmon.record.pictures import Picture, Row, measured_picture
 from gripmon.record.read import RecordedFrames
 from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
-from gripmon.record.rows import RowWriter
-from gripmon.record.scene import rig_view, wrist_image_view
+from gripmon.record.written_file import WrittenFile, open_stream
 
 RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32
-_FLUSH_TIMEOUT_S = 30.0
-_FREE_BYTES = 64_000_000
-"""rerun doesn't report a full disk, and writing to one may block forever: this much must be free."""
 _LOOKS = (
     (REPLAYED, "", 255, 1.5),
     (RECORDED, f"{RECORDED}/", 110, 5.0),
-)  # run, path prefix, opacity, width of its lines
+)  # run, root of its paths, opacity, width of its lines
 
 _TRACK = "rig/corrected"
 _TRACK_ROWS_A_CHUNK = 65536
-
-
-class _RecordedSender(Sender):
-    """Sends below the path ``recorded``."""
-
-    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
-        super().static(f"{RECORDED}/{path}", *archetypes)
-
-    def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
-        super().columns(f"{RECORDED}/{path}", stamps_ns, seqs, columns)
 
 
 class ComparedRecorder(Recorder):
@@ -69,20 +45,17 @@ class ComparedRecorder(Recorder):
         """``recorded_limits`` are drawn beside the replay's; None: unknown.  Raises OSError if ``path`` can't be
         written.
         """
-        path.open("wb").close()
-        self._path, self._source, self._recorded_limits = path, source, recorded_limits
-        self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
-        if self._has_space():
-            stream.set_sinks(rr.FileSink(path))
+        path.unlink(missing_ok=True)
+        self._source, self._recorded_limits = source, recorded_limits
+        stream, layout = open_stream(scene), layout_of_both(scene, f"{RECORDED}/", REPLAYED, RECORDED)
+        self._file = WrittenFile(path, stream, scene, 1, layout_file(layout), contextlib.nullcontext)
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
-        stream.send_blueprint(_layout(scene), make_active=True, make_default=True)
-        self._writer = RowWriter(stream, scene, 1)
-        send = _RecordedSender(stream)
-        self._curves, self._status = CurveWriter(send, self._writer.corner_ids), EventWriter(send, RECORDED)
-        _name_both(Sender(stream))
+        send = Sender(stream, f"{RECORDED}/")
+        self._curves, self._status = CurveWriter(send, self._file.writer.corner_ids), EventWriter(send, RECORDED)
+        _name_both(stream)
         self._rows: list[Row] = []
         self._rows_then: list[Row] = []
-        self._events = Events.at_first(scene.reference)
+        self._events = Events(references=[scene.reference])
         self._commands_then = list(source.commands)
 
     def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
@@ -106,37 +79,38 @@ class ComparedRecorder(Recorder):
 
     def close(self, timeout_s: float = 2.0) -> None:
         self._write()
-        if self.failure is not None:
-            return
-        self._writer.finish()
-        self._curves.finish()
-        try:
-            self._stream.flush(timeout_sec=max(timeout_s, _FLUSH_TIMEOUT_S))
-        except Exception as error:  # noqa: BLE001 - rerun raises its own kinds
-            self.failure = f"can't write {self._path}: {one_line(error)}"
-        self._stream.disconnect()
-
-    def _has_space(self) -> bool:
-        if self.failure is None and shutil.disk_usage(self._path.parent).free < _FREE_BYTES:
-            self.failure = f"can't write {self._path}: less than {1e-6 * _FREE_BYTES:.0f} MB are free"
-        return self.failure is None
+        with self._failing():
+            if self.failure is None:
+                self._curves.finish()
+                self._file.finish()
+            self._file.close()
 
     def _write(self) -> None:
         rows, then, events = self._rows, self._rows_then, self._events
         self._rows, self._rows_then, self._events = [], [], Events()
-        if not rows or not self._has_space():
+        if not rows or self.failure is not None:
             return
-        self._writer.write(rows, events)
+        self._file.writer.write(rows, events)
         self._curves.write(then)
         newest = rows[-1].record.seq
         commands = [command for command in self._commands_then if command.seq <= newest]
         self._commands_then = [command for command in self._commands_then if command.seq > newest]
         self._status.write(then, Events(commands=commands))
+        with self._failing():
+            self._file.flush()
+
+    @contextlib.contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.failure = self.failure or f"can't write {self._file.path}: {error.strerror or error}"
 
 
-def _name_both(send: Sender) -> None:
+def _name_both(stream: rr.RecordingStream) -> None:
     """Both runs in the same colours: the recorded one wide and pale, the replayed one thin."""
-    for whose, where, alpha, width in _LOOKS:
+    for whose, root, alpha, width in _LOOKS:
+        send = Sender(stream, root)
         for path, names, colours in (
             ("drift/tcp_shift_mm", ("x", "y", "z", "length"), (*Palette.AXES, Palette.WHOLE)),
             ("drift/limits_mm", ("warning", "limit"), (Palette.DOUBTFUL, Palette.BAD)),
@@ -144,31 +118,7 @@ def _name_both(send: Sender) -> None:
             ("protection/limit_mm", ("alert limit",), (Palette.BAD,)),
         ):
             pale = [faded(colour, alpha) for colour in colours]
-            send.lines(f"{where}{path}", [f"{whose} {name}" for name in names], pale, width)
-
-
-def _layout(scene: Scene) -> rrb.Blueprint:
-    """Left: the image with the replay's overlay, and the events of both runs.  Right: drifts and limits of both in one
-    plot, and the states of both.
-    """
-
-    def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
-        return plot("/", [f"{where}{path}" for where in (f"{RECORDED}/", "") for path in paths], name, legend=False)
-
-    drift = both(
-        ("drift/limits_mm", "drift/tcp_shift_mm"),
-        f"TCP drift (mm): x red, y green, z blue, length white; wide, pale: {RECORDED}, thin: {REPLAYED}",
-    )
-    turn = both(("drift/delta_deg", "drift/limits_deg"), "δ (°) and its limits, of both")
-    bounds = both(("protection/level_mm", "protection/limit_mm"), "Protection level (mm) and alert limit, of both")
-    states = [
-        rrb.StateTimelineView(origin=origin, name=f"State and verdict, {whose}", time_view=AXIS)
-        for origin, whose in ((f"{RECORDED}/status", RECORDED), ("status", REPLAYED))
-    ]
-    details = rrb.Tabs(rig_view(scene), turn, bounds, active_tab=0)
-    log = log_view("/", ["events", f"{RECORDED}/events"], f", {REPLAYED} and {RECORDED}")
-    judged = rrb.Vertical(drift, *states, details, row_shares=[4.5, 2, 2, 3])
-    return two_columns([wrist_image_view(scene), log], [6, 3], judged)
+            send.lines(path, [f"{whose} {name}" for name in names], pale, width)
 
 
 def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:

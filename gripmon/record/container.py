@@ -1,7 +1,5 @@
 """An ``.rrd`` file as a sequence of messages: a header of 12 bytes, then for each message its kind and length (8 bytes
 each, little endian) and its body, which only rerun understands.
-
-All private parts of rerun-sdk 0.41 that gripmon uses are at the end of this file: a later version may lack them.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 MAGIC = b"RRF2"
 HEADER_BYTES = 12
@@ -78,20 +76,3 @@ def whole_bytes(path: Path) -> int:
             walk = Walk(path)
             return walk.size if walk.damaged else min(walk.end, walk.size)
     return path.stat().st_size
-
-
-class RerunChangedError(RuntimeError):
-    """The installed rerun lacks something that is needed; the text names it and the version that has it."""
-
-
-def free_closed_streams() -> None:
-    """Release disconnected streams: rerun would keep each one, with its threads, until the process ends."""
-    import rerun as rr
-
-    bindings: Any = getattr(rr, "bindings", None)
-    name = "flush_and_cleanup_orphaned_recordings"
-    free = getattr(bindings, name, None)
-    if free is None:
-        wanted = "gripmon needs rerun-sdk>=0.41,<0.42 (pip install 'rerun-sdk>=0.41,<0.42')"
-        raise RerunChangedError(f"rerun-sdk {rr.__version__} has no rerun.bindings.{name}; {wanted}")
-    free()

@@ -10,20 +10,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from gripmon.model.records import (
-    Absolute,
-    AlertEvent,
-    AlertKind,
-    FrameRecord,
-    Limits,
-    Protection,
-    ReferenceRecord,
-    Severity,
-    SinceReference,
-)
+from gripmon.model.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 from gripmon.record.columns import Colour, Palette, Sender, faded
 from gripmon.record.pictures import Row
 from gripmon.record.recorder import TraceNote, pairs
+from gripmon.record.table import COLUMNS, Column
 
 _LIMITS_PERIOD_NS = 2_000_000_000
 _DEG = math.degrees(1.0)
@@ -82,16 +73,6 @@ def _error_mm(row: Row, reference_tcp_m: _Position | None) -> _Values:
     if truth_mm is None:
         return None
     return np.subtract(shift_mm, truth_mm).tolist() if shift_mm and truth_mm else []
-
-
-def _bound(name: str, unit: str) -> Callable[[Row, _Position | None], _Values]:
-    def values(row: Row, _: _Position | None) -> _Values:
-        bound: Protection | SinceReference | Absolute | None = getattr(row.record, name)
-        if bound is None:
-            return None
-        return [1e3 * bound.position_m if unit == "mm" else _DEG * bound.rotation_rad]
-
-    return values
 
 
 def _both(size: int, raw: Sequence[float], other: Sequence[float]) -> Sequence[float]:
@@ -173,31 +154,46 @@ _BOTH = [f"{axis}{side}" for side in ("-", "+") for axis in "xyz"]
 _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 _ANY: list[Colour] = []  # the viewer's own colours
 
+_DRAWN = {"m": ("_mm", 1e3), "rad": ("_deg", _DEG), "ns": ("_us", 1e-3), "1": ("", 1.0)}
+"""Units of the frame table: those of its curves, and what its values are multiplied by."""
+_LOOKS = {
+    "protection/since_reference": (_FAINT, 1.0),
+    "protection/absolute": (_FAINT, 1.0),
+    "quality/corners_used": ([Palette.CORNER_USED], 1.5),
+}
+
+
+def curve_path(column: Column) -> str:
+    """The entity of a column's curve; empty if it has none."""
+    return "" if column.curve is None else f"{column.curve[0]}{_DRAWN[column.unit][0]}"
+
+
+def _of_column(column: Column) -> Curve:
+    assert column.curve is not None
+    (stem, name), scale = column.curve, _DRAWN[column.unit][1]
+    colours, width = _LOOKS.get(stem, (_WHOLE, 1.5))
+
+    def values(row: Row, _: _Position | None) -> _Values:
+        value = column.of(row.record)
+        return [] if value is None else [scale * value]
+
+    return Curve(curve_path(column), [name], colours, width, values)
+
+
 FRAME_CURVES = (
+    *(_of_column(column) for column in COLUMNS.values() if column.curve is not None),
     Curve("drift/tcp_shift_mm", [*"xyz", "length"], [*_AXES, Palette.WHOLE], 1.8, _shift_mm),
     Curve("drift/tcp_shift_sigma_mm", [f"{name}σ" for name in _BOTH], _PALE * 2, 0.7, _band_mm),
     Curve("drift/tcp_shift_smoothed_mm", [f"{axis} smoothed" for axis in "xyz"], _PALE, 1.5,
           lambda r, tcp_m: _from_mm(None if r.record.smoothed is None else r.record.smoothed.translation_m, tcp_m)),
-    Curve("drift/d_mm", ["d"], _WHOLE, 1.5,
-          lambda r, _: [] if r.record.drift is None else [1e3 * r.record.drift.translation_m]),
-    Curve("drift/delta_deg", ["δ"], _WHOLE, 1.5,
-          lambda r, _: [] if r.record.drift is None else [_DEG * r.record.drift.rotation_rad]),
     Curve("drift/truth_mm", [f"true {axis}" for axis in "xyz"], _PALER, 6.0, _truth_mm),
     Curve("drift/error_mm", [*"xyz"], _AXES, 1.0, _error_mm),
-    *(Curve(f"protection/{path}_{unit}", [named], colours, width, _bound(name, unit)) for unit in ("mm", "deg")
-      for path, name, named, colours, width in (
-          ("level", "protection", "protection level", _WHOLE, 1.5),
-          ("since_reference", "since_reference", "since the reference", _FAINT, 1.0),
-          ("absolute", "absolute", "absolute", _FAINT, 1.0))),
     Curve("transform", [*_POSE, *(f"{name} smoothed" for name in _POSE)], _ANY, 0.0, _poses),
     Curve("sigma/tcp_um", [*"xyz"], _AXES, 1.5, _sigmas(_XYZ, 1e6)),
     Curve("sigma/rotation_deg", [*"xyz"], _AXES, 1.5, _sigmas(_TURNS, _DEG)),
     Curve("test/share", ["statistic / threshold"], _WHOLE, 1.5,
           lambda r, _: [] if r.statistic_share is None else [r.statistic_share]),
-    Curve("quality/corners_used", ["corners used"], [Palette.CORNER_USED], 1.5,
-          lambda r, _: [float(sum(corner.used for corner in r.record.corners))]),
     Curve("jaw/reported_m", [], _ANY, 0.0, lambda r, _: [] if r.jaw_reported_m is None else [r.jaw_reported_m]),
-    Curve("timing/latency_us", [], _ANY, 0.0, lambda r, _: [1e-3 * r.record.latency_ns]),
     Curve("residual/rms_px", ["corners, rms", "edge points, rms"], [Palette.CORNER_USED, Palette.EDGE_USED], 1.5,
           _rms_px),
 )  # fmt: skip

@@ -25,6 +25,8 @@ from gripmon.record.recorder import Events, Scene
 from gripmon.record.taking import FileInbox, Load
 
 if TYPE_CHECKING:
+    import rerun as rr
+
     from gripmon.record.pictures import Row
     from gripmon.record.written_file import WrittenFile
 
@@ -62,7 +64,7 @@ class FileSeries(FileInbox):
 
     def __init__(self, scene: Scene) -> None:
         """Touches no disk yet, and imports no rerun."""
-        super().__init__(scene.directory)
+        super().__init__(scene.directory, scene.reference)
         self._scene, self._settings, self._directory = scene, scene.settings, Path(scene.directory)
         budget_bytes = self._settings.budget_bytes
         self._budget = DiskBudget(self._directory, scene.robot, scene.camera, scene.name, budget_bytes)
@@ -71,16 +73,14 @@ class FileSeries(FileInbox):
         self._alerts: deque[PinnedBy] = deque(maxlen=_FILES_REMEMBERED)
         self._ended: deque[WrittenFile] = deque(maxlen=_FILES_REMEMBERED)
         self._file: WrittenFile | None = None
+        self._stream: rr.RecordingStream | None = None
         self._layout: bytes | None = None
-        self._newest_reference = scene.reference
         self._unsaid: Events = Events()  # of the time without a file
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
 
     def write(self) -> None:
         """Write what has been added to disk; begin, end or change the file as needed."""
         load = self._taken()
-        if load.events.references:
-            self._newest_reference = load.events.references[-1]
         load.events, self._unsaid = self._unsaid + load.events, Events()
         for alert, stamp_ns in load.pins:
             self._pin(alert, stamp_ns)
@@ -109,10 +109,7 @@ class FileSeries(FileInbox):
     def _fill(self, file: WrittenFile, load: Load) -> None:
         """Write some of a load and take it out as it reaches the disk: what is left is lost if that fails."""
         rows = load.rows[: _fitting(load.rows)]
-        events = load.events
-        if file.bytes == 0 and self._newest_reference not in events.references:
-            events = Events.at_first(self._newest_reference) + events
-        file.writer.write(rows, events)
+        file.writer.write(rows, self._with_reference(load.events) if file.bytes == 0 else load.events)
         file.flush()
         file.cover([row.record.stamp_ns for row in rows])
         self.frames_written += len(rows)
@@ -172,11 +169,12 @@ class FileSeries(FileInbox):
 
     def _begin(self) -> None:
         """Begin the next file."""
-        from gripmon.record.scene import layout_file
-        from gripmon.record.written_file import WrittenFile
+        from gripmon.record.layout import layout_file, layout_of
+        from gripmon.record.written_file import WrittenFile, open_stream
 
+        self._stream = self._stream or open_stream(self._scene)
         if self._layout is None:
-            self._layout = layout_file(self._scene)
+            self._layout = layout_file(layout_of(self._scene))
             with self._asking_disk():
                 self.notice = mend(self._budget)
         with self._asking_disk():
@@ -188,7 +186,7 @@ class FileSeries(FileInbox):
                 raise _Paused(missing)
             number = self._next_number()
             path = self._directory / f"{self._scene.name}-{number:04d}.rrd"
-        self._file = WrittenFile(path, self._scene, number, self._layout, self._asking_disk)
+        self._file = WrittenFile(path, self._stream, self._scene, number, self._layout, self._asking_disk)
         self.path = str(path)
 
     def _next_number(self) -> int:

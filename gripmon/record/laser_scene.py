@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 
 from gripmon.laser.setup import LaserSetup, laser_lines, spots_on_plane
+from gripmon.model.atomic import write_atomically
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array
@@ -25,9 +26,8 @@ _PLANE_MARGIN, _PLANE_LEAST_M = 1.3, 0.01  # half a side: this much more than th
 
 def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
     """Write a calibration: everything in the base frame, residuals in the camera's image.  Raises OSError."""
-    path.open("wb").close()
     recording = rr.RecordingStream("gripmon_laser")
-    recording.save(path)
+    memory = recording.memory_recording()  # rerun's file sink doesn't report a full disk
     setup, log = refined.setup, Sender(recording).static
     turn, centre = _log_camera(Sender(recording), setup, refined.camera)
     spots = spots_on_plane(setup, base_T_ee)[0] @ turn.T + centre
@@ -46,7 +46,7 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
     log("base/camera/image/spots", rr.Points2D(uv_px, colors=colours, radii=2.0))
     lines = np.stack([uv_px, uv_px - refined.residuals_px], axis=1)[seen]
     log("base/camera/image/residuals", rr.LineStrips2D(lines, colors=_LEFT_OUT))
-    recording.flush()
+    write_atomically(path, memory.drain_as_bytes())
     recording.disconnect()
 
 

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 from gripmon.model.errors import one_line
-from gripmon.record.recorder import LOOPBACK, Events, Scene, ViewSettings
+from gripmon.record.recorder import LOOPBACK, Scene, ViewSettings
 from gripmon.record.taking import LiveInbox
 
 if TYPE_CHECKING:
@@ -29,47 +29,45 @@ class LiveStream(LiveInbox):
     """
 
     def __init__(self, scene: Scene, settings: ViewSettings) -> None:
-        super().__init__(_WAITING_MEMORY_FRACTION * settings.memory_limit_bytes)
+        super().__init__(_WAITING_MEMORY_FRACTION * settings.memory_limit_bytes, scene.reference)
         self._scene, self._settings = scene, settings
-        self._newest_reference = scene.reference
-        self._opened: tuple[rr.RecordingStream, RowWriter] | None = None
+        self._stream: rr.RecordingStream | None = None  # the same after a failure: rerun keeps every stream for good
+        self._writer: RowWriter | None = None  # None: nothing is served
         self._repeat_at = self._retry_at = 0.0
         self._stalled = False
 
     def write(self) -> None:
         """Start or restart the stream if due, and send; a server that a viewer blocks gets nothing more."""
         load, now_s = self._taken(), time.monotonic()
-        if load.events.references:
-            self._newest_reference = load.events.references[-1]
-        if self._opened is None and now_s < self._retry_at:
+        if self._writer is None and now_s < self._retry_at:
             return
         try:
-            stream, writer = self._opened = self._opened or self._begin()
+            writer = self._writer = self._writer or self._begin()
             if not self._stalled:
                 if now_s >= self._repeat_at:
                     self._repeat_at = now_s + _REPEAT_S
                     writer.repeat()
-                    if self._newest_reference not in load.events.references:
-                        load.events = Events.at_first(self._newest_reference) + load.events
+                    load.events = self._with_reference(load.events)
                 writer.write(load.rows, load.events)
                 writer.write_pictures(load.late)
-            self._flush(stream)
+            self._flush()
             self.failure = None
         except Exception as error:  # noqa: BLE001 - rerun raises its own types; none may affect the files
-            self._opened, self._stalled = None, False
+            self._writer, self._stalled = None, False
             self._retry_at = now_s + _RETRY_S
             self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({one_line(error)})"
 
     def close(self) -> None:
         """End the server; while a viewer blocks it, this doesn't return."""
-        if self._opened is not None:
-            self._opened[0].disconnect()
+        if self._writer is not None and self._stream is not None:
+            self._stream.disconnect()
 
-    def _flush(self, stream: rr.RecordingStream) -> None:
+    def _flush(self) -> None:
         """Wait until everything is sent; a server that is gone fails at once, a blocked one after a timeout."""
         begun_s, was_stalled = time.monotonic(), self._stalled
         try:
-            stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+            assert self._stream is not None, "begun"
+            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
             self._stalled = False
         except Exception:
             if time.monotonic() - begun_s < 0.9 * _FLUSH_TIMEOUT_S:
@@ -78,17 +76,17 @@ class LiveStream(LiveInbox):
         if was_stalled and not self._stalled:
             self._repeat_at = 0.0  # changes may have been among what was not shown
 
-    def _begin(self) -> tuple[rr.RecordingStream, RowWriter]:
+    def _begin(self) -> RowWriter:
         import rerun as rr
 
-        from gripmon.record.columns import APPLICATION_ID
+        from gripmon.record.layout import layout_file, layout_of
         from gripmon.record.rows import RowWriter
-        from gripmon.record.scene import make_blueprint
+        from gripmon.record.written_file import open_stream
 
-        stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+        self._stream = self._stream or open_stream(self._scene)
         limit = f"{self._settings.memory_limit_bytes}B"
-        stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
-        stream.send_recording_name(f"{self._scene.name} (live)")
-        stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
+        self._stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
+        self._stream.send_recording_name(f"{self._scene.name} (live)")
+        self._stream.log_file_from_contents("layout.rbl", layout_file(layout_of(self._scene)))
         self._repeat_at = 0.0
-        return stream, RowWriter(stream, self._scene, 0)
+        return RowWriter(self._stream, self._scene, 0)

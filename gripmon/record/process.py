@@ -1,27 +1,25 @@
 """The recording process: how the daemon starts it, talks to it and ends it; and what it does.
 
-Nothing here may import rerun or OpenCV, which the daemon's process does without, before :meth:`_Process.run`.
+Nothing here may import rerun or OpenCV, which the daemon's process does without, before :func:`_run`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import os
 import sys
 import threading
 import time
-import types
-from collections.abc import Callable, Iterator
-from multiprocessing import get_context
+from collections.abc import Callable
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from typing import Any
 
 import msgspec
 
 from gripmon.model.errors import in_short
+from gripmon.model.own_process import OwnProcess
 from gripmon.model.priority import give_way
 from gripmon.model.records import Limits
 from gripmon.model.shared_images import SharedImages
@@ -36,25 +34,21 @@ _PIPE_BYTES = 1 << 20  # as much as Linux lets everybody have
 class Worker:
     """The daemon's handle on one recording process.
 
-    The process ends by itself when the daemon closes its pipe or ends, and then writes all that it was given.  The
-    thread that starts it must block signals meant for the daemon (Ctrl-C, a service manager's SIGTERM to the group).
+    The process ends by itself when the daemon closes its pipe or ends, and then writes all that it was given.
     """
 
     def __init__(self, scene: Scene, images: SharedImages) -> None:
         """Raises OSError if no process can be started."""
-        theirs, self._batches = get_context("spawn").Pipe(duplex=False)
-        self._reports, told = get_context("spawn").Pipe(duplex=False)
+        theirs, self._batches = Pipe(duplex=False)
+        self._reports, told = Pipe(duplex=False)
         with contextlib.suppress(OSError):  # else what is sent while it starts waits in this process
             fcntl.fcntl(self._batches.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        self._process = _Process(scene, images, theirs, told)
+        inherited = theirs.fileno(), told.fileno()
         try:
-            with _no_main_module():
-                self._process.start()
-        except (OSError, AssertionError) as error:
+            self._process = OwnProcess(_run, scene, images, *inherited, inherits=(*inherited, images.descriptor))
+        except OSError:
             self._batches.close()
             self._reports.close()
-            if isinstance(error, AssertionError):  # multiprocessing's, in a worker of its pool
-                raise OSError(errno.EPERM, "a daemonic process may have no children; a Pool's worker is one") from None
             raise
         finally:
             theirs.close()
@@ -112,59 +106,40 @@ class Worker:
             self.still_writes = self._reports.poll(_BEAT_WAIT_S)
             self.look()
             self.still_writes &= not self.gone
+        if self.still_writes:
+            self._process.leave()
         return None if self.still_writes else self.reap()
 
     def reap(self) -> str | None:
         """Wait for the end of a process that is :attr:`gone`, kill any other, and close everything."""
         failure = None
         if self.gone:
-            self._process.join(_KILL_WAIT_S)
-        if self._process.is_alive():
-            self.kill()
-            self._process.join(_KILL_WAIT_S)
+            self._process.ended_within(_KILL_WAIT_S)
+        if self._process.runs:
             failure = "the recording process did not finish in time; the end of its last file may be missing"
+            self.kill()
         for pipe in (self._batches, self._reports):
             pipe.close()
-        if self._process.is_alive():
+        if not self._process.ended_within(_KILL_WAIT_S):
+            self._process.leave()
             return "the recording process hangs in a disk that doesn't answer, and was left there"
-        code = self._process.exitcode
-        self._process.close()
+        code = self._process.returncode
         return failure or (None if code == 0 else f"the recording process ended with code {code}")
 
     def kill(self) -> None:
         """Kill it, from any thread: a blocked :meth:`send` then returns."""
-        with contextlib.suppress(ValueError):  # it is closed already
-            self._process.kill()
+        self._process.kill()
 
 
-@contextlib.contextmanager
-def _no_main_module() -> Iterator[None]:
-    """The new process would otherwise import the program's main module: anybody's script, which may have no guard."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-
-
-class _Process(SpawnProcess):
-    def __init__(self, scene: Scene, images: SharedImages, batches: Connection, reports: Connection) -> None:
-        super().__init__(name="gripmon-recording", daemon=False)
-        self._given = scene, images, batches, reports
-
-    def join(self, timeout: float | None = 0.0) -> None:
-        """At the end of the interpreter, multiprocessing joins every process; this one must not be waited for."""
-        super().join(timeout)
-
-    def run(self) -> None:
-        os.setsid()  # what a terminal does to the daemon isn't meant for this process
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # whoever reads the daemon's output waits for its end
-        # Errors with files are in the status; rerun's own lines on stderr would only repeat them.
-        os.environ |= {"RUST_LOG": os.environ.get("RUST_LOG", "off"), "RERUN": "on"}
-        give_way()
-        _or_end(_record, *self._given)
-        os._exit(0)  # everything is written; a viewer that stalls may still hold the live view's thread
+def _run(scene: Scene, images: SharedImages, batches: int, reports: int) -> None:
+    """What the process does; it is given the descriptors of its ends of the pipes."""
+    # Errors with files are in the status; rerun's own lines on stderr would only repeat them.
+    os.environ |= {"RUST_LOG": os.environ.get("RUST_LOG", "off"), "RERUN": "on"}
+    give_way()
+    taken: Connection[Any, Any] = Connection(batches, writable=False)
+    told: Connection[Any, Any] = Connection(reports, readable=False)
+    _or_end(_record, scene, images, taken, told)
+    os._exit(0)  # everything is written; a viewer that stalls may still hold the live view's thread
 
 
 def _or_end(work: Callable[..., None], *given: Any) -> None:

@@ -8,7 +8,7 @@ ever blocks the interpreter in which the loop runs.  The daemon itself never imp
 from __future__ import annotations
 
 import uuid
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -16,8 +16,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.model.camera import Camera, LensSettings
-from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.camera import LensSettings
+from gripmon.model.gripper import GripperModel
 from gripmon.model.outputs import Event, Output
 from gripmon.model.records import (
     AlertRecord,
@@ -127,10 +127,12 @@ class Recorder(Output):
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
-    """The first message: everything that doesn't change while a recording runs."""
+    """What the recording process is started with: everything that doesn't change while a recording runs.
+
+    ``recording_id``: an id of its own, unless one is given.
+    """
 
     name: str
-    recording_id: str
     directory: str
     settings: RecordingSettings
     robot: str
@@ -142,29 +144,16 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     version: str = __version__
     configuration: RecordedConfiguration | None = None
     view: ViewSettings | None = None  # served live, too
+    recording_id: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.recording_id:
+            msgspec.structs.force_setattr(self, "recording_id", f"{self.name}-{uuid.uuid4()}")
 
     @property
     def tcp_m(self) -> NDArray[np.float64]:
         """The TCP at the reference, in the camera frame."""
         return np.array(self.reference.cam_T_grip.translation_m)
-
-
-def make_scene(
-    settings: RecordingSettings,
-    directory: str,
-    name: str,
-    robot: str,
-    camera_name: str,
-    camera: Camera,
-    gripper: Gripper,
-    reference: ReferenceRecord,
-    **more: Any,
-) -> Scene:
-    """The scene, with an id of its own.  ``more``: its optional fields."""
-    return Scene(
-        name=name, recording_id=f"{name}-{uuid.uuid4()}", directory=directory, settings=settings, robot=robot,
-        camera=camera_name, lens=camera.settings, gripper=gripper.model, reference=reference, **more,
-    )  # fmt: skip
 
 
 class TraceNote(msgspec.Struct, frozen=True, array_like=True):
@@ -210,11 +199,6 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
         if isinstance(event, ReferenceRecord):
             return Events(references=[event])
         return Events(commands=[event]) if isinstance(event, RecordedCommand) else Events(states=[event])
-
-    @staticmethod
-    def at_first(reference: ReferenceRecord | None) -> Events:
-        """The events that a file begins with: the reference in force, if any."""
-        return Events(references=[] if reference is None else [reference])
 
     def __bool__(self) -> bool:
         return any(msgspec.structs.astuple(self))

@@ -13,8 +13,6 @@ import functools
 import itertools
 import multiprocessing
 import os
-import subprocess
-import sys
 import tempfile
 import threading
 import warnings
@@ -25,16 +23,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gripmon.model.errors import one_line
+from gripmon.model.own_process import OwnProcess
 from gripmon.record.container import HEADER_BYTES, MAGIC, STORE_INFO, Message, Walk, is_complete
 
 FRAME = "frame"
 """The timeline of frame numbers."""
 _IDLE_S = 20.0
-_HOME = str(Path(__file__).resolve().parents[2])
-_BOOTSTRAP = (
-    "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
-    "from gripmon.record.rrd import serve; serve(int(sys.argv[2]))"
-)
 
 
 class UnreadableFileError(ValueError):
@@ -192,14 +186,8 @@ class ChildProcess:
 
     def __init__(self) -> None:
         self._connection, theirs = multiprocessing.Pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _BOOTSTRAP, _HOME, str(theirs.fileno())],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,  # what is wrong comes back as an answer
-            pass_fds=(theirs.fileno(),),
-            start_new_session=True,
-        )
+        # What is wrong comes back as an answer.
+        self._process = OwnProcess(serve, theirs.fileno(), inherits=(theirs.fileno(),), quiet=True)
         theirs.close()
         atexit.register(self.close)
         self._lock = threading.Lock()
@@ -212,7 +200,7 @@ class ChildProcess:
     @property
     def alive(self) -> bool:
         """Also reaps it."""
-        return self._process.poll() is None and not self._connection.closed
+        return self._process.runs and not self._connection.closed
 
     def read(self, query: Query) -> Iterator[Any]:
         """The answers to a query."""

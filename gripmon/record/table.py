@@ -30,7 +30,7 @@ _BLOCK_ROWS = 4096
 @dataclass(frozen=True)
 class Column:
     """``of`` gives a record's value, of this ``type`` and ``shape``; None becomes NaN.  ``names``: it is a code, an
-    index into them.
+    index into them.  ``curve``: the path of its curve in a recording, without the unit, and the curve's name.
     """
 
     of: Callable[[FrameRecord], Any]
@@ -39,14 +39,17 @@ class Column:
     type: type[np.generic] = np.float64
     shape: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
+    curve: tuple[str, str] | None = dataclasses.field(default=None, kw_only=True)
 
 
-def _column(unit: str, help_: str, of: Callable[[FrameRecord], Any], *more: Any) -> Any:
-    return dataclasses.field(metadata={"column": Column(of, unit, help_, *more)})
+def _column(
+    unit: str, help_: str, of: Callable[[FrameRecord], Any], *more: Any, curve: tuple[str, str] | None = None
+) -> Any:
+    return dataclasses.field(metadata={"column": Column(of, unit, help_, *more, curve=curve)})
 
 
-def _whole(unit: str, help_: str, of: Callable[[FrameRecord], Any]) -> Any:
-    return _column(unit, help_, of, np.int64)
+def _whole(unit: str, help_: str, of: Callable[[FrameRecord], Any], curve: tuple[str, str] | None = None) -> Any:
+    return _column(unit, help_, of, np.int64, curve=curve)
 
 
 def _pose(help_: str, of: Callable[[FrameRecord], Transform | Smoothed | Absolute | None]) -> Any:
@@ -79,6 +82,8 @@ _STATES = (*(s.value for s in State), OTHER)
 _ORIGINS = (*(o.value for o in Origin), OTHER)
 _VALID_BY = tuple(v.value for v in ValidBy)
 _SINCE = (*(s.value for s in Since), OTHER)
+_LEVEL = ("protection/level", "protection level")
+_SINCE_REFERENCE, _ABSOLUTE = ("protection/since_reference", "since the reference"), ("protection/absolute", "absolute")
 _POSITION, _ANGLE = "bound on the TCP's position error", "bound on the angle of the rotation error"
 
 
@@ -108,9 +113,11 @@ class FrameTable:
         lambda r: _NAN_3 if r.drift is None else r.drift.tcp_shift_m, np.float64, (3,),
     )  # fmt: skip
     protection_m: FloatArray = _column(
-        "m", f"protection level: {_POSITION}", lambda r: r.protection and r.protection.position_m
+        "m", f"protection level: {_POSITION}", lambda r: r.protection and r.protection.position_m, curve=_LEVEL
     )
-    protection_rad: FloatArray = _column("rad", _ANGLE, lambda r: r.protection and r.protection.rotation_rad)
+    protection_rad: FloatArray = _column(
+        "rad", _ANGLE, lambda r: r.protection and r.protection.rotation_rad, curve=_LEVEL
+    )
     integrity_risk: FloatArray = _column(
         "1", "probability per frame that the error exceeds a bound", lambda r: r.protection and r.protection.risk
     )
@@ -120,11 +127,11 @@ class FrameTable:
     )  # fmt: skip
     since_reference_m: FloatArray = _column(
         "m", f"{_POSITION} of the motion since the reference",
-        lambda r: r.since_reference and r.since_reference.position_m,
+        lambda r: r.since_reference and r.since_reference.position_m, curve=_SINCE_REFERENCE,
     )  # fmt: skip
     since_reference_rad: FloatArray = _column(
         "rad", "bound on the angle of its rotation error",
-        lambda r: r.since_reference and r.since_reference.rotation_rad,
+        lambda r: r.since_reference and r.since_reference.rotation_rad, curve=_SINCE_REFERENCE,
     )  # fmt: skip
     since: CodeArray = _code(
         "what that motion counts from: reference or first_proved",
@@ -135,18 +142,22 @@ class FrameTable:
         lambda r: -1 if r.since_reference is None else r.since_reference.since_ns,
     )  # fmt: skip
     absolute_m: FloatArray = _column(
-        "m", f"{_POSITION} of the transform as measured", lambda r: r.absolute and r.absolute.position_m
-    )
+        "m", f"{_POSITION} of the transform as measured", lambda r: r.absolute and r.absolute.position_m,
+        curve=_ABSOLUTE,
+    )  # fmt: skip
     absolute_rad: FloatArray = _column(
-        "rad", "bound on the angle of its rotation error", lambda r: r.absolute and r.absolute.rotation_rad
-    )
+        "rad", "bound on the angle of its rotation error", lambda r: r.absolute and r.absolute.rotation_rad,
+        curve=_ABSOLUTE,
+    )  # fmt: skip
     absolute: FloatArray = _pose("the transform as measured", lambda r: r.absolute)
     d_m: FloatArray = _column(
-        "m", "length of the camera's displacement against the reference", lambda r: r.drift and r.drift.translation_m
-    )
+        "m", "length of the camera's displacement against the reference", lambda r: r.drift and r.drift.translation_m,
+        curve=("drift/d", "d"),
+    )  # fmt: skip
     delta_rad: FloatArray = _column(
-        "rad", "turn of the camera against the reference", lambda r: r.drift and r.drift.rotation_rad
-    )
+        "rad", "turn of the camera against the reference", lambda r: r.drift and r.drift.rotation_rad,
+        curve=("drift/delta", "δ"),
+    )  # fmt: skip
     cam_T_grip: FloatArray = _pose("maps gripper to camera coordinates; what valid_by names", lambda r: r.cam_T_grip)
     covariance: FloatArray = _covariance("cam_T_grip", lambda r: r.covariance)
     smoothed: FloatArray = _pose("cam_T_grip averaged over time", lambda r: r.smoothed)
@@ -160,11 +171,13 @@ class FrameTable:
     rms_px: FloatArray = _column("px", "root mean square of the corners' residuals", lambda r: r.rms_px)
     jaw_opening_m: FloatArray = _column("m", "as the image shows it", lambda r: r.jaw_opening_m)
     latency_ns: IntArray = _whole(
-        "ns", "from when the frame came to the monitor's machine to judged", lambda r: r.latency_ns
-    )
+        "ns", "from when the frame came to the monitor's machine to judged", lambda r: r.latency_ns,
+        curve=("timing/latency", "latency"),
+    )  # fmt: skip
     corners_used: NDArray[np.int32] = _column(
-        "1", "corners that the transform rests on", lambda r: sum([c.used for c in r.corners]), np.int32
-    )
+        "1", "corners that the transform rests on", lambda r: sum([c.used for c in r.corners]), np.int32,
+        curve=("quality/corners_used", "corners used"),
+    )  # fmt: skip
     corners_total: NDArray[np.int32] = _column("1", "corners of the gripper file", lambda r: len(r.corners), np.int32)
     refused: NDArray[np.bool_] = _column("", "nothing was measured in this frame", lambda r: not r.measured, np.bool_)
     reference_ids: tuple[str, ...] = ()

@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 
 import msgspec
 
-from gripmon.model.records import Alert, AlertRecord, Limits
+from gripmon.model.records import Alert, AlertRecord, Limits, ReferenceRecord
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.keeping import Moments, PinnedBy, Trigger, pinned_by
 from gripmon.record.pictures import PictureRing, Row, encode_picture
@@ -52,7 +52,9 @@ class Load:
 class Inbox:
     """Where one thread adds what another writes."""
 
-    def __init__(self) -> None:
+    def __init__(self, reference: ReferenceRecord | None = None) -> None:
+        """``reference``: the one in force, None: unknown."""
+        self._reference = reference  # the newest that was taken
         self._changed = threading.Condition()
         self._load = Load()
         self._complete = False
@@ -105,7 +107,14 @@ class Inbox:
     def _taken(self) -> Load:
         with self._changed:
             load, self._load = self._load, Load()
-            return load
+        if load.events.references:
+            self._reference = load.events.references[-1]
+        return load
+
+    def _with_reference(self, events: Events) -> Events:
+        """What a stream begins with, and a live one repeats: the reference in force before all else."""
+        known = self._reference
+        return events if known is None or known in events.references else Events(references=[known]) + events
 
     def _much_waits(self) -> bool:
         many = len(self._load.rows) >= _ROWS_AT_ONCE
@@ -120,8 +129,8 @@ class LiveInbox(Inbox):
 
     failure: str | None = None
 
-    def __init__(self, most_bytes: float) -> None:
-        super().__init__()
+    def __init__(self, most_bytes: float, reference: ReferenceRecord | None = None) -> None:
+        super().__init__(reference)
         self._most_bytes = most_bytes
 
     def _bound(self, load: Load) -> None:
@@ -149,8 +158,8 @@ class FileInbox(Inbox):
     notice: str | None = None
     """Findings about earlier files."""
 
-    def __init__(self, directory: str) -> None:
-        super().__init__()
+    def __init__(self, directory: str, reference: ReferenceRecord | None = None) -> None:
+        super().__init__(reference)
         self.directory = directory
         self.frames_written = self.frames_lost = self.images_lost = 0
         self.disk_asked_s: float | None = None

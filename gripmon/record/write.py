@@ -5,12 +5,10 @@ from __future__ import annotations
 import datetime
 import logging
 import math
-import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import msgspec
@@ -37,7 +35,6 @@ from gripmon.record.recorder import (
     Scene,
     Status,
     ViewSettings,
-    make_scene,
     pack_trace,
 )
 from gripmon.record.waiting import Waiting, WaitingFrames
@@ -53,7 +50,6 @@ _STOPPED_TIMEOUT_S = 2.0
 _LEFT_AFTER_S = 10.0  # of a process that even a signal doesn't end
 _LOSSES_PERIOD_S = 60.0  # between two log lines about losses
 _EVENTS_KEPT = 4096  # while there is no process
-_FOR_THE_DAEMON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 Truth = Callable[[int], tuple[float, float, float] | None]
 
@@ -181,9 +177,6 @@ class ProcessRecorder(Recorder):
             time.sleep(ROOM_POLL_S)
 
     def _run(self) -> None:
-        # Processes inherit the mask of the thread that starts them; multiprocessing's own helper would undo it.
-        resource_tracker.ensure_running()
-        signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_DAEMON)
         period_s = HANDOVER_PERIOD_S if self._patience_s == 0.0 else ROOM_POLL_S
         try:
             while True:
@@ -319,7 +312,7 @@ class ProcessRecorder(Recorder):
         if not self._slot_free(worker, due):
             self._images_without_slot += due
             return None
-        place = self._images.put(worker.images_sent % self._images.slots, image)
+        place = self._images.put(worker.images_sent, image)
         worker.images_sent += 1
         return place
 
@@ -371,8 +364,9 @@ def open_recorder(
         where.mkdir(parents=True, exist_ok=True)
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
-    scene = make_scene(
-        settings, str(where.resolve()), name, robot, camera_name, camera, gripper, reference,
-        has_truth=truth_tcp_m is not None, configuration=configuration, view=view,
+    scene = Scene(
+        name=name, directory=str(where.resolve()), settings=settings, robot=robot, camera=camera_name,
+        lens=camera.settings, gripper=gripper.model, reference=reference, has_truth=truth_tcp_m is not None,
+        configuration=configuration, view=view,
     )  # fmt: skip
     return ProcessRecorder(scene, truth_tcp_m, patience_s)

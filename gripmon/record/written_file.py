@@ -19,7 +19,6 @@ from pathlib import Path
 import rerun as rr
 
 from gripmon.record.columns import APPLICATION_ID
-from gripmon.record.container import RerunChangedError, free_closed_streams
 from gripmon.record.recorder import Scene
 from gripmon.record.rows import RowWriter
 
@@ -29,13 +28,9 @@ _ENCODED_WITHIN_S = 60.0
 rr.set_strict_mode(True)  # else rerun only warns
 
 
-def _free_earlier_files() -> None:
-    try:
-        free_closed_streams()
-    except RerunChangedError:
-        raise
-    except RuntimeError:
-        pass  # a live view whose server has ended: it says so itself
+def open_stream(scene: Scene) -> rr.RecordingStream:
+    """Of all files of a recording, one after another: rerun keeps every stream, with two threads, for good."""
+    return rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
 
 
 class WrittenFile:
@@ -44,6 +39,7 @@ class WrittenFile:
     def __init__(
         self,
         path: Path,
+        stream: rr.RecordingStream,
         scene: Scene,
         number: int,
         layout: bytes,
@@ -51,14 +47,14 @@ class WrittenFile:
     ) -> None:
         """Begins the file, with what each one needs: layout and static data.  Raises OSError, also if it exists.
 
-        ``asking_disk`` is entered for as long as the disk is waited for.
+        ``stream`` is of no other file until this one is closed.  ``asking_disk`` is entered for as long as the disk is
+        waited for.
         """
         self.path, self.begun_s = path, time.monotonic()
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.frames = 0
         self.bytes = 0  # on disk, whole messages
-        _free_earlier_files()
         self._freed = 0  # from the beginning of the memory
         self._asking_disk = asking_disk
         with asking_disk():
@@ -66,7 +62,7 @@ class WrittenFile:
             with contextlib.suppress(OSError):  # some network file systems have no locks
                 fcntl.flock(self._disk, fcntl.LOCK_EX)  # others see that it is being written
         self._memory = os.memfd_create("gripmon-rrd")
-        self._stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
+        self._stream = stream
         self._stream.set_sinks(rr.FileSink(f"/proc/self/fd/{self._memory}"))
         self._stream.send_recording_name(scene.name)
         self._stream.log_file_from_contents("layout.rbl", layout)
@@ -97,7 +93,6 @@ class WrittenFile:
             return
         disk, memory, self._disk, self._memory = self._disk, self._memory, -1, -1
         self._stream.disconnect()
-        del self._stream, self.writer  # which keep rerun's threads
         os.close(memory)
         with self._asking_disk():
             os.close(disk)

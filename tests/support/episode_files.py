@@ -6,6 +6,7 @@ Paths and columns of LeRobot's are those of ``lerobot.datasets.utils`` 0.4.4, wr
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -22,6 +23,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from gripmon.model.camera import BrownConradyLens
 from gripmon.model.records import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+
+from benchmarks.dataset_set import write_video
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 NS = 1_000_000_000
@@ -133,21 +138,6 @@ def encoded(images: Sequence[Image], codec: str) -> list[bytes]:
     return [bytes(packet) for packet in packets]
 
 
-def write_video(path: Path, images: Sequence[Image], fps: int, codec: str = "libsvtav1") -> None:
-    """As LeRobot encodes: AV1 (or another ``codec``), a key frame now and then."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    height, width = images[0].shape[:2]
-    preset = {"preset": "12"} if codec == "libsvtav1" else {}
-    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream(codec, rate=fps, options={"g": "5", "crf": "8"} | preset)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for i, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(image, format="gray").reformat(format="yuv420p")
-            frame.pts, frame.time_base = i, Fraction(1, fps)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-
-
 def write_lerobot(
     root: Path, episodes: Sequence[Shots], *, fps: int, version: str = "v3.0", per_file: int = 4, codec="libsvtav1"
 ) -> None:
@@ -193,7 +183,8 @@ def write_lerobot(
         table.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.concat_tables(tables), table)
         images = [image for shots in group for image in shots.images]
-        write_video(root / info["video_path"].format(**at, video_key=WRIST), images, fps, codec)
+        video = root / info["video_path"].format(**at, video_key=WRIST)
+        write_video(video, images, fps, codec, key_every=5, crf=8)
     if new:
         (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(places), root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")

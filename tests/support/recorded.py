@@ -34,7 +34,7 @@ from gripmon.model.records import (
     ValidBy,
     Verdict,
 )
-from gripmon.record.recorder import RecordingSettings
+from gripmon.record.recorder import RecordingSettings, Scene
 from gripmon.record.write import ProcessRecorder, open_recorder
 
 START_NS = 1_700_000_000_123_456_789
@@ -60,6 +60,14 @@ REFERENCE = ReferenceRecord(
 
 def settings(**changes: Any) -> RecordingSettings:
     return msgspec.structs.replace(RecordingSettings(min_free_bytes=0, flush_period_s=0.1), **changes)
+
+
+def scene(directory: Path, name: str = "run", **changes: Any) -> Scene:
+    """``changes``: of the settings."""
+    return Scene(
+        name=name, directory=str(directory), settings=settings(**changes), robot="arm", camera="wrist",
+        lens=CAMERA.settings, gripper=GRIPPER.model, reference=REFERENCE,
+    )  # fmt: skip
 
 
 def recorder(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -59,7 +60,7 @@ def render(folder: Path, config: Path) -> list[list[float]]:
         cam_T_grip = perturb(loaded.cam_T_grip, np.array([0.001 * (number % 2), 0.0, 0.001 * (number // 2), 0, 0, 0.0]))
         simulator = Simulator(loaded.camera, loaded.gripper, cam_T_grip, scenario, number)
         frames = [simulator.frame(i) for i in range(simulator.frame_count)]
-        _write_video(_video(folder, number), [np.asarray(frame.image) for frame in frames])
+        write_video(_video(folder, number), [np.asarray(frame.image) for frame in frames], FPS)
         openings_m.append([float(frame.jaw_opening_m or 0.0) for frame in frames])
     return openings_m
 
@@ -111,16 +112,21 @@ def _video(folder: Path, number: int) -> Path:
     return folder / "videos" / CAMERA / "chunk-000" / f"file-{number:03d}.mp4"
 
 
-def _write_video(path: Path, images: list[np.ndarray]) -> None:
-    """AV1, as LeRobot encodes: a key frame every other one."""
+def write_video(
+    path: Path, images: Sequence[np.ndarray], fps: int, codec: str = "libsvtav1", *, key_every: int = 2, crf: int = 30
+) -> None:
+    """Grey images as LeRobot encodes them: AV1 (or another ``codec``) at a constant quality, a key frame now and then
+    (every other one, by default).
+    """
     os.environ.setdefault("SVT_LOG", "1")  # errors alone
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = images[0].shape[:2]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libsvtav1", rate=FPS, options={"g": "2", "crf": "30", "preset": "12"})
+    preset = {"preset": "12"} if codec == "libsvtav1" else {}
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream(codec, rate=fps, options={"g": str(key_every), "crf": str(crf)} | preset)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for number, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(image, format="gray").reformat(format="yuv420p")
-            frame.pts, frame.time_base = number, Fraction(1, FPS)
+            frame.pts, frame.time_base = number, Fraction(1, fps)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))

@@ -22,7 +22,7 @@ from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.files import FileSeries
 from gripmon.record.pictures import Row, encode_picture
-from gripmon.record.recorder import Events, Scene, make_scene, pack_trace
+from gripmon.record.recorder import Events, Scene, pack_trace
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),
@@ -57,11 +57,14 @@ def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, A
     """Write the hour: quiet but for some frames in its middle, in which the mount creeps back and forth."""
     cv2.setNumThreads(1)
     config = scene.config_for(plan.size)
-    names = config.settings.robot, config.settings.camera_name
     settings = msgspec.structs.replace(
         config.settings.recording, min_free_bytes=0, budget_bytes=0, max_file_s=1e9, max_file_bytes=1 << 40
     )
-    described = make_scene(settings, str(directory), "hour", *names, config.camera, config.gripper, config.reference)
+    described = Scene(
+        name="hour", directory=str(directory), settings=settings, robot=config.settings.robot,
+        camera=config.settings.camera_name, lens=config.camera.settings, gripper=config.gripper.model,
+        reference=config.reference,
+    )  # fmt: skip
     calm, busy = _judge(scene.Ring.load(quiet), plan.quiet), _judge(scene.Ring.load(moving), plan.moving)
     start_s = time.monotonic()
     images = _write(described, _sequence(calm.rows, busy.rows, plan.frames), plan)

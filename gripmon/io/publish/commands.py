@@ -12,7 +12,7 @@ import zenoh
 
 from gripmon.io.publish.presence import Answers, Presence, in_words, send_now
 from gripmon.io.wire import Keys, Link, in_zenohs_thread
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.records import (
     Command,
     CommandError,

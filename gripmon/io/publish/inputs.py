@@ -9,7 +9,7 @@ import zenoh
 
 from gripmon.io.jaw import LARGEST_OPENING_M, Openings, ReportedOpening
 from gripmon.io.wire import Link, in_zenohs_thread
-from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.errors import in_short
 from gripmon.model.jaw import JawError
 from gripmon.model.records import JawReading, MessageRefused, from_json, largest_bytes

@@ -14,8 +14,9 @@ from gripmon.io.sources.bags import BagSettings, BagSource, is_rosbag2
 from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
 from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
 from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
-from gripmon.io.sources.live import LiveCamera, LiveSettings, NewestFrame
+from gripmon.io.sources.live import LiveCamera, LiveSettings
 from gripmon.io.sources.network import ArrivingCamera, NetworkCamera, NetworkSettings
+from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.ros2 import Ros2Camera, Ros2CameraSettings
 from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link
@@ -79,9 +80,7 @@ def open_source(
     """Start a source; paths in its settings are relative to ``relative_to``, the folder of the configuration file.
 
     Only the simulator needs a ``scene``; a camera on the network needs the session, the monitor's keys and, as one of
-    ROS 2, the size of the images: (width, height), by default that of the scene's camera.  The simulator's real-time
-    camera starts another Python process by ``multiprocessing``, so a script that opens one needs the guard
-    ``if __name__ == "__main__"``.
+    ROS 2, the size of the images: (width, height), by default that of the scene's camera.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that isn't a
     video, and a device of unknown form.  A camera that is absent at present is not an error: the source waits for it.

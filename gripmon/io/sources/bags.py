@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from gripmon.io.sources.base import SourceError, Stored
-from gripmon.io.sources.camera_info import lens_of
+from gripmon.io.sources.camera_info import is_rectified, lens_of
 from gripmon.io.sources.payload import PayloadError, message_image
 from gripmon.io.sources.stamps import Stamped, rising
 from gripmon.io.sources.stored import (
@@ -220,7 +220,7 @@ class BagSource(Stored):
             return None
         try:
             message = next(self._bag.messages(near or topics), None)
-            return None if message is None else lens_of(message.decode(), rectified="rect" in self.topic)
+            return None if message is None else lens_of(message.decode(), rectified=is_rectified(self.topic))
         except Exception as error:  # noqa: BLE001  each library's own
             raise SourceError(f"camera: {self._path}: {(near or topics)[0]}: {one_line(error)}") from None
 

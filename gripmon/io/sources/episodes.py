@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import posixpath
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -64,7 +66,7 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         name = path[len(inside) :].strip("/")
         at, version = system.unstrip_protocol(path) if remote else path, _version([files[part] for part in parts])
         if kind is LeRobotSettings:
-            episodes += _of_lerobot(at, name, cameras, version)
+            episodes += _of_lerobot(at, name, cameras, {file[len(path) + 1 :]: found[file] for file in parts})
         elif kind is BagSettings:
             name = name or posixpath.basename(path)
             episodes += [Episode(name, BagSettings(path=at, camera=camera), version) for camera in cameras or (None,)]
@@ -90,7 +92,7 @@ def _recordings(files: Sequence[str]) -> Iterator[tuple[type[Any], str, list[str
         folder, name = posixpath.split(path)
         if path.endswith(f"/{INFO}"):
             taken.add(dataset := path[: -len(INFO) - 1])
-            yield LeRobotSettings, dataset, [path]
+            yield LeRobotSettings, dataset, [each for each in files if each.startswith(f"{dataset}/")]
         elif name == "metadata.yaml" and any(each.endswith((".db3", ".mcap")) for each in folders[folder]):
             taken.add(folder)
             yield BagSettings, folder, folders[folder]
@@ -106,22 +108,44 @@ def _recordings(files: Sequence[str]) -> Iterator[tuple[type[Any], str, list[str
                 yield BagSettings if suffix == ".mcap" else VideoSettings, path, [path]
 
 
-def _of_lerobot(path: str, name: str, cameras: Sequence[str], version: str) -> list[Episode]:
+def _of_lerobot(path: str, name: str, cameras: Sequence[str], files: dict[str, dict[str, Any]]) -> list[Episode]:
+    """``files``: the dataset's, by their paths in it."""
+    open_dataset.cache_clear()  # it may have changed since
     dataset = open_dataset(path)
     named = ", ".join(dataset.cameras) or "none"
     if not cameras and len(dataset.cameras) != 1:
         raise SourceError(f"camera: {path} has {len(dataset.cameras)}; name those at the wrist: {named}")
     if absent := [camera for camera in cameras if camera not in dataset.cameras]:
         raise SourceError(f"camera: {path} has no {absent[0]}; of: {named}")
+
+    def version(number: int, camera: str) -> str:
+        """Of what the episode is made of: others may come to the dataset meanwhile."""
+        own = dataset.files(number, camera)
+        found = [files.get(file[len(path) + 1 :], {"name": file, "islink": True}) for file in own]
+        return hash_of([dataset.description, dataset.episodes[number], _version(found)])
+
     return [
-        Episode(f"{name}#{number:06d}", LeRobotSettings(path=path, camera=camera, episode=number), version)
+        Episode(
+            f"{name}#{number:06d}", LeRobotSettings(path=path, camera=camera, episode=number), version(number, camera)
+        )
         for number in sorted(dataset.episodes)
         for camera in cameras or dataset.cameras
     ]
 
 
 def _version(files: Sequence[dict[str, Any]]) -> str:
-    return hash_of([[one.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")] for one in files])
+    return hash_of([_facts(one) for one in files])
+
+
+def _facts(file: dict[str, Any]) -> list[Any]:
+    """What tells that a file changed, as its store lists it; a link to one, or what is behind a link to a folder, isn't
+    listed by what it leads to.
+    """
+    if file.get("islink"):
+        with contextlib.suppress(OSError):
+            there = Path(file["name"]).stat()
+            return [there.st_size, there.st_mtime_ns]
+    return [file.get(key) for key in ("size", "mtime", "ETag", "LastModified", "created")]
 
 
 def hash_of(value: Any) -> str:

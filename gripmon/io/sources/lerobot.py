@@ -7,6 +7,7 @@ its description is checked, and its paths lead to files inside it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 import string
@@ -99,6 +100,15 @@ class LeRobotDataset:
         places = self._places(episode, f"videos/{camera}")
         begin_s = self._number(episode, f"videos/{camera}/from_timestamp") or 0.0
         return self._file("video_path", places | {"video_key": camera}), begin_s
+
+    def files(self, episode: int, camera: str) -> list[str]:
+        """Paths of the table and the video of an episode, as far as the description has them."""
+        found = []
+        with contextlib.suppress(SourceError):  # who opens the episode is told
+            found.append(self.table(episode))
+            if self.description.features[camera].dtype == "video":
+                found.append(self.video(episode, camera)[0])
+        return found
 
     def _places(self, episode: int, of: str) -> dict[str, int | str]:
         found = {name: self._number(episode, f"{of}/{name}") for name in ("chunk_index", "file_index")}

@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import select
-import signal
 import threading
 import time
-from multiprocessing import resource_tracker
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.model.errors import in_short
+from gripmon.model.own_process import OwnProcess
 from gripmon.model.priority import give_way
-from gripmon.model.records import Frame, Image
+from gripmon.model.records import Frame
 from gripmon.model.records.values import NS_PER_S
+from gripmon.model.shared_images import ImagePlace, SharedImages
 
 _log = logging.getLogger(__name__)
 _SLOTS = 12  # a frame stays readable for at least 12 - MOST_PROCESSES frame periods after it was announced
 MOST_PROCESSES = 4
-_WRITING = -1
 _END_WITHIN_S = 0.5
 _SLEEP_S = 0.05  # longest sleep of a renderer without checking whether it should end
 _START_WITHIN_S = 60.0
@@ -61,20 +57,16 @@ class SimulatedCamera:
         frame_count: int | None = None,
         processes: int = 1,
     ) -> None:
-        """``size_px`` is (width, height) of the 8-bit grey images, ``frame_count`` None means for ever."""
+        """``size_px`` is (width, height) of the images, ``frame_count`` None means for ever."""
         assert 1 <= processes <= MOST_PROCESSES
-        context = multiprocessing.get_context("spawn")
-        width, height = size_px
-        memory = context.RawArray("B", _SLOTS * height * width)
-        self._ring = _Ring(memory, context.RawArray("q", _SLOTS), (height, width))
+        self._images = SharedImages(_SLOTS, *size_px)
         self._name = name
         self._lock = threading.Lock()  # held while reading, so that close() leaves a read under way its pipes
-        self._closing = False
+        self._closing = self._closed = False
         self._last_seq = -1
         self._dropped = 0
         self._running = [
-            _Renderer(context, maker, self._ring, _Schedule(fps, first, processes, frame_count))
-            for first in range(processes)
+            _Renderer(maker, self._images, _Schedule(fps, first, processes, frame_count)) for first in range(processes)
         ]
         self._all = tuple(self._running)
         self._poll = select.poll()
@@ -123,6 +115,9 @@ class SimulatedCamera:
         with self._lock:
             for renderer in self._all:
                 renderer.announcements.close()
+            if not self._closed:
+                self._images.close()
+            self._closed = True
 
     def _newest(self) -> _Announcement | None:
         """The newest announcement that has arrived; RuntimeError if a renderer ended early."""
@@ -148,7 +143,7 @@ class SimulatedCamera:
         """The announced frame; None if a newer one was read before, or if it was overwritten meanwhile."""
         if announced is None or announced.seq <= self._last_seq:
             return None
-        image = self._ring.copy(announced.seq)
+        image = self._images.copy(announced.place)
         if image is None:
             return None
         self._dropped += announced.seq - self._last_seq - 1
@@ -160,6 +155,7 @@ class SimulatedCamera:
 class _Announcement(NamedTuple):
     seq: int
     stamp_ns: int
+    place: ImagePlace
     jaw_opening_m: float | None
 
 
@@ -180,23 +176,13 @@ class _Schedule(NamedTuple):
 class _Renderer:
     """The parent's end of a rendering process."""
 
-    def __init__(self, context: Any, maker: FrameMaker, ring: _Ring, schedule: _Schedule) -> None:
-        self.announcements, announce = context.Pipe(duplex=False)
-        commands, self.commands = context.Pipe(duplex=False)
-        self._process = context.Process(
-            target=_render,
-            args=(maker, ring, schedule, announce, commands),
-            name=f"gripmon-simulator-{schedule.first}",
-            daemon=True,
-        )
-        _start_with_signals_blocked(self._process)
-        announce.close()
-        commands.close()
-
-    @property
-    def pid(self) -> int:
-        assert self._process.pid is not None
-        return int(self._process.pid)
+    def __init__(self, maker: FrameMaker, images: SharedImages, schedule: _Schedule) -> None:
+        self.announcements, announce = Pipe(duplex=False)
+        commands, self.commands = Pipe(duplex=False)
+        theirs = announce.fileno(), commands.fileno()
+        with announce, commands:
+            self._process = OwnProcess(_run, maker, images, schedule, *theirs, inherits=(*theirs, images.descriptor))
+        self.pid = self._process.pid
 
     def await_ready(self) -> None:
         end_s = time.monotonic() + _START_WITHIN_S
@@ -214,64 +200,45 @@ class _Renderer:
             raise SourceError(f"scenario: can't be rendered ({failure}); a scenario that fits camera and gripper")
 
     def how_it_ended(self) -> str:
-        self._process.join(_END_WITHIN_S)
-        return f"the rendering process ended with exit code {self._process.exitcode}"
+        self._process.ended_within(_END_WITHIN_S)
+        return f"the rendering process ended with exit code {self._process.returncode}"
 
     def end(self) -> None:
-        self._process.join(_END_WITHIN_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        if not self._process.ended_within(_END_WITHIN_S):
+            self._process.end()
 
 
-class _Ring:
-    """Shared images; a slot's mark names the frame that lies in it whole."""
-
-    def __init__(self, memory: Any, marks: Any, shape: tuple[int, int]) -> None:
-        self._shared = (memory, marks, shape)
-        self._marks: NDArray[np.int64] = np.frombuffer(marks, np.int64)
-        self._images: NDArray[np.uint8] = np.frombuffer(memory, np.uint8).reshape(_SLOTS, *shape)
-
-    def __reduce__(self) -> tuple[type[_Ring], tuple[Any, Any, tuple[int, int]]]:
-        return _Ring, self._shared
-
-    def put(self, index: int, image: Image) -> None:
-        if image.shape != self._images.shape[1:] or image.dtype != np.uint8:
-            raise ValueError(f"the image is {image.shape} {image.dtype}, not {self._images.shape[1:]} uint8")
-        slot = index % _SLOTS
-        self._marks[slot] = _WRITING
-        self._images[slot] = image
-        self._marks[slot] = index
-
-    def copy(self, index: int) -> Image | None:
-        slot = index % _SLOTS
-        if self._marks[slot] != index:
-            return None
-        image = self._images[slot].copy()
-        return image if self._marks[slot] == index else None
+def _run(maker: FrameMaker, images: SharedImages, schedule: _Schedule, announce: int, commands: int) -> None:
+    """A rendering process; it is given the descriptors of its ends of the pipes."""
+    told: Connection[Any, Any] = Connection(announce, readable=False)
+    heard: Connection[Any, Any] = Connection(commands, writable=False)
+    _render(_Canvas(maker, images), schedule, told, heard)
 
 
-def _start_with_signals_blocked(process: Any) -> None:
-    """Ctrl-C reaches the whole process group, but only the parent may end a renderer."""
-    resource_tracker.ensure_running()  # starting it later would undo the mask
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)
+class _Canvas(NamedTuple):
+    maker: FrameMaker
+    images: SharedImages
+
+    def draw(self, index: int) -> tuple[ImagePlace, float | None]:
+        """Render a frame into its slot; where it is, and the jaw opening that belongs to it."""
+        frame = self.maker.frame(index)
+        if not self.images.takes(frame.image):
+            raise ValueError(f"image {index} isn't one of the camera's size, or of another type than 8 or 16 bits")
+        assert frame.image is not None
+        return self.images.put(index, frame.image), frame.jaw_opening_m
 
 
-def _render(maker: FrameMaker, ring: _Ring, schedule: _Schedule, announce: Connection, commands: Connection) -> None:
+def _render(canvas: _Canvas, schedule: _Schedule, announce: Connection, commands: Connection) -> None:
     """A rendering process: announces None when its first frame is ready, then frames, at the end None; or a text."""
     import cv2
 
     cv2.setNumThreads(1)
     give_way()
     try:
-        opening_m = _draw(maker, ring, schedule.first)
+        drawn = canvas.draw(schedule.first)
         announce.send(None)
         os.set_blocking(announce.fileno(), False)
-        _deliver(maker, ring, schedule, announce, commands, opening_m)
+        _deliver(canvas, schedule, announce, commands, drawn)
     except (BrokenPipeError, EOFError):
         return  # the parent has closed the camera, or is gone
     except Exception as error:  # noqa: BLE001  the parent raises it
@@ -281,12 +248,11 @@ def _render(maker: FrameMaker, ring: _Ring, schedule: _Schedule, announce: Conne
 
 
 def _deliver(
-    maker: FrameMaker,
-    ring: _Ring,
+    canvas: _Canvas,
     schedule: _Schedule,
     announce: Connection,
     commands: Connection,
-    opening_m: float | None,
+    drawn: tuple[ImagePlace, float | None],
 ) -> None:
     start_s, start_ns = commands.recv()  # both clocks are the machine's, not the process's
     index = schedule.first
@@ -295,20 +261,12 @@ def _deliver(
             return
         # A full pipe: it is not being read.  This frame counts as dropped, like the older ones that it overwrote.
         with contextlib.suppress(BlockingIOError):
-            announce.send(_Announcement(index, start_ns + round(index * NS_PER_S / schedule.fps), opening_m))
+            announce.send(_Announcement(index, start_ns + round(index * NS_PER_S / schedule.fps), *drawn))
         index = schedule.following(index, time.monotonic() - start_s)
         if schedule.end is None or index < schedule.end:
-            opening_m = _draw(maker, ring, index)
+            drawn = canvas.draw(index)
     os.set_blocking(announce.fileno(), True)
     announce.send(None)
-
-
-def _draw(maker: FrameMaker, ring: _Ring, index: int) -> float | None:
-    """Render a frame into its slot; the jaw opening that belongs to it."""
-    frame = maker.frame(index)
-    assert frame.image is not None
-    ring.put(index, frame.image)
-    return frame.jaw_opening_m
 
 
 def _sleep_until(due_s: float, commands: Connection) -> bool:

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 
 from gripmon.io.jaw import LARGEST_OPENING_M, Openings, ReportedOpening
 from gripmon.io.ros2.node import Ros2Missing, RosNode, check_rclpy
 from gripmon.io.ros2.settings import Domain, Topic
 from gripmon.io.sources.base import SourceError
-from gripmon.io.sources.camera_info import lens_of
+from gripmon.io.sources.camera_info import is_rectified, lens_fault, lens_of
 from gripmon.io.sources.network import Arrival, ArrivingCamera, Content, SilentAfter, largest_bytes_of
 from gripmon.io.sources.payload import PayloadError, file_image, message_image
-from gripmon.io.wire.link import Malformed
-from gripmon.model.camera import Camera, make_camera
+from gripmon.io.wire.malformed import Malformed
+from gripmon.model.camera import Camera
 from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG, PNG
 from gripmon.model.jaw import JointOpening, positions_by_joint
 from gripmon.model.records.values import NS_PER_S
-
-_log = logging.getLogger(__name__)
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 JAW_MAX_AGE_S = 1.0
@@ -72,10 +68,8 @@ class Ros2Camera(ArrivingCamera):
         self._openings = Openings(travel_m, JAW_MAX_AGE_S)
         self._joints = Malformed("joint state", settings.joint_states or "")
         self._subscription: Any = None
-        self._type = self._waits = self._info = self._info_fault = ""
+        self._type = self._waits = self._info = self._info_fault = self._contradiction = ""
         self._next_info_s = 0.0
-        self.compared_px: float | None = None
-        """How far the first CameraInfo is from ``camera`` at most (px); None if none has come."""
         try:
             check_rclpy()
             self._node = RosNode("gripmon_input", "/", settings.domain_id, self._set_up, self._tend)
@@ -155,16 +149,17 @@ class Ros2Camera(ArrivingCamera):
         topic = self._settings.camera_info
         try:
             info = deserialize_message(message, CameraInfo)
-            lens = lens_of(info, rectified="rect" in self.key)
+            lens = lens_of(info, rectified=is_rectified(self.key))
+            told = repr((lens, info.roi, info.binning_x, info.binning_y))
             if not self._info and self._camera is not None and lens is not None:
-                self.compared_px = apart(self._camera, make_camera(lens))
-                _log.info("%s is at most %.2g px from the configuration's camera", topic, self.compared_px)
+                self._contradiction = lens_fault(lens, self._camera.settings) or ""
         except Exception as error:  # noqa: BLE001  rclpy's own for what it can't decode
             self._info_fault = f"{topic}: {one_line(error)}"
             return
-        told = repr((lens, info.roi, info.binning_x, info.binning_y))
         self._info = self._info or told
-        self._info_fault = "" if told == self._info else f"{topic} isn't that of the start any more; start again"
+        self._info_fault = f"{topic}: {self._contradiction}" if self._contradiction else ""
+        if told != self._info:
+            self._info_fault = f"{topic} isn't that of the start any more; start again"
 
     def _content(self, arrival: Arrival) -> Content:
         from rclpy.serialization import deserialize_message
@@ -194,10 +189,3 @@ def _stamp_ns(message: Any) -> int:
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise PayloadError(f"header.stamp: {stamp.sec} s and {stamp.nanosec} ns isn't a time")
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-
-
-def apart(camera: Camera, other: Camera) -> float:
-    """How far apart two cameras' pixels of one ray are at most, over a grid of the first one's image (px)."""
-    grid = np.meshgrid(np.linspace(0.0, camera.width_px - 1.0, 9), np.linspace(0.0, camera.height_px - 1.0, 9))
-    uv_px = np.stack(grid, axis=-1).reshape(-1, 2)
-    return float(np.nanmax(np.linalg.norm(other.distort(camera.undistort(uv_px)) - uv_px, axis=1)))

@@ -4,7 +4,8 @@ network.
 
 from __future__ import annotations
 
-from gripmon.io.wire.link import Link, Router, in_zenohs_thread
+from gripmon.io.wire.link import Link, in_zenohs_thread
+from gripmon.io.wire.router import Router
 from gripmon.io.wire.session import (
     CLOCK_PARAMETER,
     DEFAULT_ENDPOINT,

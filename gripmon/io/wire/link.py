@@ -1,4 +1,4 @@
-"""A session that may open later, with its waiting users; a router in this process; malformed messages."""
+"""A session that may open later, with its waiting users; which of its connections are missing."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ import logging
 import re
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from gripmon.io.wire.session import (
     PublishSettings,
-    ZenohFileError,
     endpoints,
-    load_file,
     open_session,
     value_of,
     zenoh_config,
@@ -196,136 +193,3 @@ def is_at(locator: str, endpoint: str) -> bool:
     if far_place["port"] != named_place["port"]:
         return False
     return far_place["host"] == named_place["host"] or not _NUMERIC.fullmatch(named_place["host"])
-
-
-class Router:
-    """Routes from construction to :meth:`close`."""
-
-    def __init__(self, path: Path) -> None:
-        """``path``: a Zenoh configuration, json5 or yaml.  Raises :class:`ZenohFileError`."""
-        import zenoh
-
-        config = load_file(path, default_mode="router")
-        if (mode := value_of(config, "mode")) != "router":
-            raise ZenohFileError(f"{path}: mode: {mode} doesn't route; router")
-        self.listens_on = endpoints(config, "listen")
-        if not self.listens_on:
-            raise ZenohFileError(f'{path}: listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]')
-        self._connects_to = endpoints(config, "connect")
-        config.insert_json5("listen/exit_on_failure", "true")
-        try:
-            self._session = zenoh.open(config)
-        except zenoh.ZError as error:
-            raise ZenohFileError(f"{path}: can't route: {zenohs_words(error)}") from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def fault(self) -> str:
-        """Which connections are missing, in a few words for people; empty if none."""
-        places = missing(self._session, self._connects_to, one_is_enough=False)
-        return f"no connection to {places}, trying again" if places else ""
-
-    def close(self) -> None:
-        """Leave the network and free the port."""
-        self._session.close()
-
-
-REMEMBERED_S = 60.0
-"""Time after the last malformed payload during which it is reported; a later one is a new occasion (s)."""
-
-CALM_S = 3.0
-"""Time with only good payloads after which malformed ones are no longer reported (s)."""
-
-_LONGEST_REASON = 200
-_MOST_KINDS = 8  # of reasons; a sender may cause any number
-_OTHERS = "any other"
-FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
-
-
-class Malformed:
-    """Counts the payloads on a key that could not be used.
-
-    An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is empty sooner, when only good ones
-    have come for :data:`CALM_S`, and the count then starts again.  The log gets one line per occasion for each of the
-    first few kinds of reasons, and the text of :meth:`fault`, with the most frequent reason, changes only when the
-    count passes a power of ten, so that malformed payloads can't fill a log or load the network.  Thread-safe.
-    """
-
-    def __init__(self, what: str, key: str) -> None:
-        """``what``: name of the payload, in the singular: ``frame``."""
-        self._what, self._key = what, key
-        self._lock = threading.Lock()
-        self._count = self._here = 0
-        self._reason = ""
-        self._kinds: Counter[str] = Counter()  # reasons without figures, since the last calm
-        self._examples: dict[str, str] = {}
-        self._logged: set[str] = set()  # kinds logged on this occasion
-        self._last_s = self._good_s = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of malformed payloads so far."""
-        return self._count
-
-    def add(self, reason: str) -> None:
-        """Count a malformed payload; ``reason`` may contain data from the sender."""
-        now_s = time.monotonic()
-        with self._lock:
-            if now_s - self._last_s > REMEMBERED_S:
-                self._logged.clear()
-                self._examples.clear()
-            if self._is_over(now_s):
-                self._here, self._kinds = 0, Counter()
-            kind = self._kind(reason)
-            before = _roughly(self._here)
-            self._count += 1
-            self._here += 1
-            self._kinds[kind] += 1
-            self._last_s = now_s
-            if _roughly(self._here) != before:
-                self._reason = self._examples[self._kinds.most_common(1)[0][0]]
-            is_new = kind not in self._logged
-            self._logged.add(kind)
-            message = f"malformed {self._what} on {self._key}: {_for_people(reason)}"
-        if is_new:
-            _log.warning("%s (logged once)", message)
-
-    def _kind(self, reason: str) -> str:
-        """The kind of a reason: its text without figures, or "any other" if there are too many kinds."""
-        text = _for_people(reason)
-        kind = FIGURES.sub("", text)
-        if kind not in self._examples and len(self._examples) >= _MOST_KINDS:
-            kind = _OTHERS
-        self._examples.setdefault(kind, text)
-        return kind
-
-    def _is_over(self, now_s: float) -> bool:
-        return now_s - self._last_s > REMEMBERED_S or self._good_s - self._last_s > CALM_S
-
-    def good(self) -> None:
-        """Note a good payload."""
-        self._good_s = time.monotonic()
-
-    def fault(self) -> str:
-        """The rough number since the last calm, and the most frequent reason, for people; empty if it is over."""
-        with self._lock:
-            if self._here == 0 or self._is_over(time.monotonic()):
-                return ""
-            several = "s" * (self._here > 1)
-            return f"{_roughly(self._here)} malformed {self._what}{several} on {self._key}: {self._reason}"
-
-
-def _roughly(count: int) -> str:
-    if count < 10:
-        return "1" if count == 1 else "some"
-    return f"over {10 ** (len(str(count)) - 1):,}"
-
-
-def _for_people(reason: str) -> str:
-    """One line of bounded length, without control characters for a terminal."""
-    line = " ".join(reason[: 2 * _LONGEST_REASON].split())
-    return "".join(c if c.isprintable() else "?" for c in line[:_LONGEST_REASON])

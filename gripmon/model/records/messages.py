@@ -29,17 +29,17 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     robot: Annotated[str, Meta(description="second part of the monitor's keys")]
     camera: Annotated[str, Meta(description="third part of the monitor's keys")]
     state: State
-    verdict: Annotated[Verdict, Meta(description="of the last transform; unknown without frames")]
-    stamp_ns: Annotated[int, Meta(description="when it was said, Unix ns")]
+    verdict: Annotated[Verdict, Meta(description="verdict of the last transform; unknown without frames")]
+    stamp_ns: Annotated[int, Meta(description="time of this message, Unix ns")]
     seq: Annotated[int, Meta(description="the last frame's; -1 before the first")]
     reference_id: Annotated[str, Meta(description="the reference in force")]
-    revision: Annotated[int, Meta(description="of the reference in force")]
-    frames: Annotated[int, Meta(description="handled since the start")]
-    frames_refused: Annotated[int, Meta(description="of these, how many couldn't be measured at all")]
-    frames_dropped: Annotated[int, Meta(description="that came while another one was worked on")]
+    revision: Annotated[int, Meta(description="revision of the reference in force; grows with every change of it")]
+    frames: Annotated[int, Meta(description="frames processed since the start")]
+    frames_refused: Annotated[int, Meta(description="of these, frames that could not be measured at all")]
+    frames_dropped: Annotated[int, Meta(description="frames that came while another one was processed")]
     frames_per_s: Annotated[float, Meta(description="rate of the last frames, 1/s; 0 while none come")]
-    uptime_s: Annotated[float, Meta(description="since the start, s")]
-    camera_connected: Annotated[bool, Meta(description="the source is open")]
+    uptime_s: Annotated[float, Meta(description="time since the monitor's start, s")]
+    camera_connected: Annotated[bool, Meta(description="whether the source is open")]
     recording_dropped: Annotated[int, Meta(description="frames that the recording had no time for")]
     message: Annotated[str, Meta(description="what is wrong, in words; empty when all is well")]
     version: Annotated[str, Meta(description="of gripmon")]
@@ -59,8 +59,10 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         float | None,
         Meta(description="position error of the TCP that the task tolerates, as configured, m; null: unknown"),
     ] = None
-    open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
-    transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
+    open_alerts: Annotated[
+        tuple[StandingAlert, ...], Meta(description="alerts raised and not cleared yet, oldest first")
+    ] = ()
+    transforms_unsent: Annotated[int, Meta(description="transforms that came before there was a Zenoh session")] = 0
     malformed: Annotated[
         int, Meta(description="messages received that were none: jaw openings, frames, commands")
     ] = 0
