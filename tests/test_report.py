@@ -16,7 +16,8 @@ from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, 
 from gripmon.analyse.build import build
 from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
-from gripmon.analyse.page import JudgedPicture, cut_alike, page
+from gripmon.analyse.page import page
+from gripmon.analyse.pictures import cut_alike
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -496,7 +497,7 @@ def test_what_is_not_used_is_not_shown_in_green():
     )
     green = []
     for used in (True, False):
-        (shown,) = cut_alike([JudgedPicture(picture, used)])
+        (shown,) = cut_alike([picture], [used])
         data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))
