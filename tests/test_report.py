@@ -479,6 +479,14 @@ def test_a_size_has_no_uncertainty_that_leaves_light_and_bevels_out():
     assert report.recordings[0].events[0].moved.sigma_m is not None, "the frames' noise is in the data"
 
 
+def test_how_large_a_step_may_be_missing_is_told():
+    """The frames' covariance allows 9.3 times 30 µm between two backgrounds; nobody is told that nothing moved."""
+    report, told = build([Run(records(np.zeros((300, 3))))])
+    assert report.recordings[0].missable_m == pytest.approx(9.3 * 3e-5, rel=0.02)
+    assert f"Steps may be missing up to {1e3 * report.recordings[0].missable_m:.3g} mm" in text_of(page(report, told))
+    assert only(Run(records(np.full((50, 3), np.nan)))).missable_m is None
+
+
 def test_the_picture_of_a_creep_shows_it():
     t = np.arange(1000) / FPS
     shifts_m = np.zeros((1000, 3))

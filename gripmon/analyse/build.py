@@ -56,7 +56,8 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
     track = make_track(table, source.references, None if start is None else start.reference_error)
     histories = histories_of(source.alerts, track)
     alerted_ns = [one.stamp_ns for history in histories if history.is_motion for one in history.alerts]
-    motions = motions_of(track, histories, change_points_of(source, track, alerted_ns, limits), limits)
+    points, missable_m = change_points_of(source, track, alerted_ns, limits)
+    motions = motions_of(track, histories, points, limits)
     events = [*motions, *(alert_event(each) for each in histories if not each.is_motion), *pauses_of(track)]
     events += reference_changes(events, source.references, track)
     affected = [*motion_ranges(track, motions, limits), *verdict_ranges(track, table)]
@@ -84,6 +85,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         commands=tuple(
             CommandEntry(track.time_of(c.seq, c.stamp_ns), c.name, c.argument, c.done, c.text) for c in source.commands
         ),
+        missable_m=missable_m,
         integrity=integrity_of(table, limits),
         faults=(*(fault for fault in source.faults if fault not in dropped), *track.faults),
     )
@@ -92,8 +94,9 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
 
 def _numbered(events: Sequence[Event], source: Recording, track: Track) -> tuple[Event, ...]:
     ordered = sorted(events, key=lambda e: (e.onset.stamp_ns, e.noticed_ns or 0))
+    images = np.flatnonzero(np.isin(track.seq, source.image_seqs))
     return tuple(
-        msgspec.structs.replace(event, number=i, **picture_seqs(event, source, track))
+        msgspec.structs.replace(event, number=i, **picture_seqs(event, source, track, images))
         for i, event in enumerate(ordered, 1)
     )
 

@@ -299,6 +299,15 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
     references: tuple[ReferenceEntry, ...]
     commands: tuple[CommandEntry, ...]
     faults: Annotated[tuple[str, ...], _is("what of it could not be used, a line each")]
+    missable_m: Annotated[
+        float | None,
+        _is(
+            "a step of the TCP without an alert may be missing among the events up to that size, since two backgrounds "
+            "may differ by it; null: not known",
+            "Steps may be missing up to",
+            millimetres,
+        ),
+    ] = None
     integrity: Annotated[
         Integrity | None, _is("null: the version that recorded it stated no bounds, or nothing was measured")
     ] = None

@@ -20,12 +20,13 @@ from gripmon import __version__
 from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR
 from gripmon.analyse.correction import SOURCES, Correction, correct, sample
 from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
-from gripmon.analyse.words import clock_time, count
+from gripmon.analyse.words import clock_time, count, millimetres
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array, Origin
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
+_MAX_SHOWN = 5
 _POSE = {
     "translation_m": [f"translation_{axis}_m" for axis in "xyz"],
     "rotation_xyzw": [f"rotation_{axis}" for axis in "xyzw"],
@@ -49,7 +50,7 @@ class CorrectedRun:
         return name_of(self.recording)
 
     def summary(self) -> str:
-        """For people: number of frames, uncertainty, and one line per change point."""
+        """For people: number of frames, uncertainty, one line per change point, and what may be missing among them."""
         made = self.correction
         sigma_um = 1e6 * float(np.median(_tcp_sigma_m(made.covariance)))
         points = count(len(made.change_points), "change point")
@@ -61,6 +62,12 @@ class CorrectedRun:
             seq = int(self.recording.frames.seq[point.index])
             when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
             lines.append(f"  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°")
+        if made.undecided_ns:
+            when = ", ".join(clock_time(stamp_ns, 3) for stamp_ns in made.undecided_ns[:_MAX_SHOWN])
+            more = ", …" if len(made.undecided_ns) > _MAX_SHOWN else ""
+            lines.append(f"  at {when}{more}: the camera moved, or the background changed (σ includes both)")
+        missable = millimetres(made.missable_m)
+        lines.append(f"  steps of up to {missable} may be missing, since another background might explain them")
         return "\n".join(lines)
 
 
@@ -102,6 +109,8 @@ def _about(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> d
                     {"seq": int(each.recording.frames.seq[point.index]), **dataclasses.asdict(point)}
                     for point in each.correction.change_points
                 ],
+                "undecided_ns": each.correction.undecided_ns,
+                "missable_m": each.correction.missable_m,
                 "learnt": each.correction.learnt,
                 "faults": [*each.recording.faults, *each.correction.faults],
             }

@@ -143,6 +143,7 @@ def _facts(r: RecordingReport) -> list[Fact]:
         Fact("Old calibration off", _lasting(r, "old_calibration"), "by more than what counts as affected"),
         Fact("No transform", _lasting(r, "unknown"), "was given"),
         *(facts(r.integrity)[:1] if r.integrity is not None else ()),
+        *facts(r),
         Fact("Recorded", recorded, "from the first frame to the last"),
     ]
 

@@ -34,13 +34,12 @@ _BEFORE: Colour = (255, 255, 255)
 Points = NDArray[np.float32]
 
 
-def picture_seqs(event: Event, source: Recording, track: Track) -> dict[str, int]:
-    """The last picture before it began, preferably with the gripper measured; the first one that shows it, of a slow
+def picture_seqs(event: Event, source: Recording, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
+    """Of the frames with ``images`` (indices): the last picture before it began, preferably with the gripper measured; the first one that shows it, of a slow
     motion with half of the way; and the first valid one after it, if it is over.  All of them differ.
     """
     if event.kind not in _SEEN:
         return {}
-    images = np.flatnonzero(np.isin(track.seq, np.asarray(source.image_seqs, np.int64)))
     table, stamps_ns = source.frames, track.stamp_ns[images]
     motion = event.kind in MOTIONS
     before = images[stamps_ns <= event.onset.earliest_ns] if motion else images[stamps_ns < event.onset.stamp_ns]

@@ -93,7 +93,8 @@ class Figure:
         """A dashed line over all of the time; a trace, since a shape's text stands elsewhere on a logarithmic axis."""
         self.add(
             row, _times([report.start_ns, report.end_ns]), [value] * 2, text, mode="lines+text", text=["", text],
-            textposition="top left", textfont={"size": 11}, hovertemplate=f"{text} %{{y:g}}<extra></extra>",
+            textposition="top left", textfont={"size": 11}, cliponaxis=False,
+            hovertemplate=f"{text} %{{y:g}}<extra></extra>",
             line={"color": NAMES[severity], "width": 1.2, "dash": "dash"},
         )  # fmt: skip
 
