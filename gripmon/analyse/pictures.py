@@ -35,8 +35,9 @@ Points = NDArray[np.float32]
 
 
 def picture_seqs(event: Event, source: Recording, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
-    """Of the frames with ``images`` (indices): the last picture before it began, preferably with the gripper measured; the first one that shows it, of a slow
-    motion with half of the way; and the first valid one after it, if it is over.  All of them differ.
+    """Of the frames with ``images`` (indices): the last one before it began, preferably with the gripper measured; the
+    first one that shows it, of a slow motion with half of the way; and the first valid one after it, if it is over.
+    All of them differ.
     """
     if event.kind not in _SEEN:
         return {}
