@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.analyse.content import Curve, Displacement
+from gripmon.analyse.vectors import to_vectors
 from gripmon.analyse.words import COVERAGE, clock_time
+from gripmon.model.geometry import from_record
 from gripmon.model.records import Array, ReferenceRecord
 
 if TYPE_CHECKING:
@@ -100,8 +102,8 @@ def make_track(
     table: FrameTable, references: Sequence[ReferenceRecord], known_error: Sequence[float] | None = None
 ) -> Track:
     """``known_error`` (6,): the configured reference's error as estimated by the monitor, if known."""
-    poses = table.cam_T_grip
-    measured = np.isfinite(poses).all(axis=1) & (table.source != table.ORIGINS.index("held"))
+    poses = table.matrices()
+    measured = np.isfinite(table.cam_T_grip).all(axis=1) & (table.source != table.ORIGINS.index("held"))
     sigma = np.sqrt(np.maximum(np.diagonal(table.covariance, axis1=1, axis2=2), 0.0))
     sigma[~measured] = np.nan
     named = list(zip(table.reference.tolist(), table.revision.tolist(), strict=True))
@@ -109,16 +111,15 @@ def make_track(
     number = np.array([place[key] for key in named], np.int64)
     keys = tuple((table.reference_ids[reference], revision) for reference, revision in place)
     records = {(r.reference_id, r.revision): r for r in references}
-    origins = np.zeros((len(keys), 7))
-    for i, key in enumerate(keys):
-        if (record := records.get(key)) is not None:
-            origins[i] = [*record.cam_T_grip.translation_m, *record.cam_T_grip.rotation_xyzw]
-        else:
-            origins[i] = _inferred_pose(table, np.flatnonzero((number == i) & measured)[:_BASE_FRAMES])
     against_reference, against_first = np.full((2, len(table), 6), np.nan)
+    for i, key in enumerate(keys):
+        mine = np.flatnonzero(measured & (number == i))
+        record = records.get(key)
+        origin_T = _inferred_T(table, poses, mine[:_BASE_FRAMES]) if record is None else from_record(record.cam_T_grip)
+        against_reference[mine] = to_vectors(origin_T, poses[mine])
+        if i == 0:
+            against_first[measured] = to_vectors(origin_T, poses[measured])
     if measured.any():
-        against_reference[measured] = _between(origins[number[measured]], poses[measured])
-        against_first[measured] = _between(np.repeat(origins[:1], measured.sum(), axis=0), poses[measured])
         error = _own_error(records.get(keys[0]), against_first[measured & (number == 0)], known_error)
         against_first -= error
         against_reference[number == 0] -= error
@@ -126,19 +127,14 @@ def make_track(
     return Track(table.seq, stamp_ns, faults, measured, against_reference, against_first, sigma, number, keys)
 
 
-def _inferred_pose(table: FrameTable, first: NDArray[np.intp]) -> Array:
-    """(7,) of a reference that isn't recorded, by its first frames and their drift; the turn is theirs."""
+def _inferred_T(table: FrameTable, poses: Array, first: NDArray[np.intp]) -> Array:
+    """(4, 4) of a reference that isn't recorded, by its first frames and their drift; the turn is theirs."""
     if not first.size:
-        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    pose = np.median(table.cam_T_grip[first], axis=0)
-    pose[:3] = np.median(table.cam_T_grip[first, :3] - table.tcp_shift_m[first], axis=0)
-    return np.asarray(pose)
-
-
-def _between(from_poses: Array, to_poses: Array) -> Array:
-    """(m, 6) from (m, 7) each: ``perturbation_between`` of the geometry, vectorised."""
-    turn = Rotation.from_quat(to_poses[:, 3:]) * Rotation.from_quat(from_poses[:, 3:]).inv()
-    return np.hstack([to_poses[:, :3] - from_poses[:, :3], turn.as_rotvec()])
+        return np.eye(4)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_matrix(poses[first, :3, :3]).mean().as_matrix()
+    pose[:3, 3] = np.median(table.cam_T_grip[first, :3] - table.tcp_shift_m[first], axis=0)
+    return pose
 
 
 def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequence[float] | None) -> Array:
