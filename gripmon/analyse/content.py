@@ -56,6 +56,15 @@ class Displacement(msgspec.Struct, frozen=True):
     rotation_sigma_rad: Annotated[float | None, _is("standard deviation of rotation_rad, likewise")] = None
 
 
+def size(moved: Displacement | None) -> str:
+    """Shift and turn of a displacement."""
+    if moved is None:
+        return "–"
+    shift = millimetres(moved.size_m, moved.sigma_m)
+    turn = "" if moved.rotation_rad is None else f", {degrees(moved.rotation_rad, moved.rotation_sigma_rad)}"
+    return shift + turn
+
+
 class Onset(msgspec.Struct, frozen=True):
     """When something began."""
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from gripmon.analyse.build import AnalysedRecording
-from gripmon.analyse.content import Event, Fact, Noise, RecordingReport, Report, facts
+from gripmon.analyse.content import Event, Fact, Noise, RecordingReport, Report, facts, size
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.pictures import pictures_of
 from gripmon.analyse.plots import Figure
@@ -27,7 +27,6 @@ from gripmon.analyse.words import (
     often,
     percent,
     signed_mm,
-    size,
     span,
 )
 from gripmon.model.records import AlertKind

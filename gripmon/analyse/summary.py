@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.analyse.affected import excess
-from gripmon.analyse.content import AffectedRange, Event, RecordingReport
+from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.words import (
     clock_time,
@@ -18,7 +18,6 @@ from gripmon.analyse.words import (
     often,
     percent,
     period,
-    size,
     span,
 )
 from gripmon.model.coverage import too_few

@@ -5,10 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from gripmon.analyse.content import Displacement
 
 COVERAGE = 2.0
 """Standard deviations of a frame's noise that count as significant, decide the digits and make the curves' bands."""
@@ -82,15 +78,6 @@ def _digits(value: float, sigma: float) -> str:
         return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
     digits = -math.floor(math.log10(COVERAGE * sigma))  # the spread's first digit is the last one shown
     return f"{value:.{min(max(digits, 0), 4)}f}"
-
-
-def size(moved: Displacement | None) -> str:
-    """Shift and turn of a displacement."""
-    if moved is None:
-        return "–"
-    shift = millimetres(moved.size_m, moved.sigma_m)
-    turn = "" if moved.rotation_rad is None else f", {degrees(moved.rotation_rad, moved.rotation_sigma_rad)}"
-    return shift + turn
 
 
 def signed_mm(values_m: Sequence[float]) -> str:
