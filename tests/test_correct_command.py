@@ -75,7 +75,11 @@ def test_json_lines_have_a_line_a_frame_and_say_where_they_come_from(estimates: 
     y = np.array([frame["cam_T_grip"]["translation_m"][1] for frame in frames])
     assert np.abs(y + 0.002 - STEP_M * (np.arange(FRAMES) >= STEP_SEQ)).max() < 2.5e-6
     assert all(len(frame["covariance"]) == 36 for frame in frames)
-    assert f"frame {STEP_SEQ}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"frame {STEP_SEQ}" in said
+    # 9.3 deviations of the axis that is known least.
+    assert run["missable_m"] == pytest.approx(9.3 * SIGMA[2], rel=0.02) and run["undecided_ns"] == []
+    assert "steps of up to 0.187 mm may be missing" in said
 
 
 def test_parquet_holds_the_same(estimates: Path, tmp_path: Path):

@@ -129,6 +129,20 @@ def test_stated_covariances_are_honest():
     assert np.mean(sizes) < 0.6 * np.mean(raw)
 
 
+def test_a_step_that_may_be_another_background_is_in_the_covariance():
+    """Six reported deviations: far beyond what frames scatter, within what two backgrounds differ by (9.3)."""
+    size = STEP * 6.0 / np.sqrt(STEP @ np.linalg.solve(reported(), STEP))
+    for seed in (5, 14):
+        stream = Stream(1800, seed, step_at(1800, 900, size), lasting=0.6)
+        correction = stream.correct()
+        assert not correction.change_points and correction.undecided_ns == (stream.stamp_ns[900],)
+        assert correction.missable_m == pytest.approx(9.3 * SIGMA[2], rel=0.03), "along the axis that is known least"
+        error = difference(stream.true, correction.cam_T_grip)
+        squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(correction.covariance), error)
+        assert squares.mean() < 6.0, "7 and 9 by a covariance for which the pose stood still"
+        assert squares.mean() > 1.5, "nor is it merely large"
+
+
 def test_gross_errors_are_disbelieved_and_named():
     stream = Stream(1800, 5)
     wrong = np.array([300, 301, 700, 1200, 1500])

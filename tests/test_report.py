@@ -16,7 +16,8 @@ from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, 
 from gripmon.analyse.build import build
 from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
-from gripmon.analyse.page import JudgedPicture, cut_alike, page
+from gripmon.analyse.page import page
+from gripmon.analyse.pictures import cut_alike
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -478,6 +479,14 @@ def test_a_size_has_no_uncertainty_that_leaves_light_and_bevels_out():
     assert report.recordings[0].events[0].moved.sigma_m is not None, "the frames' noise is in the data"
 
 
+def test_how_large_a_step_may_be_missing_is_told():
+    """The frames' covariance allows 9.3 times 30 µm between two backgrounds; nobody is told that nothing moved."""
+    report, told = build([Run(records(np.zeros((300, 3))))])
+    assert report.recordings[0].missable_m == pytest.approx(9.3 * 3e-5, rel=0.02)
+    assert f"Steps may be missing up to {1e3 * report.recordings[0].missable_m:.3g} mm" in text_of(page(report, told))
+    assert only(Run(records(np.full((50, 3), np.nan)))).missable_m is None
+
+
 def test_the_picture_of_a_creep_shows_it():
     t = np.arange(1000) / FPS
     shifts_m = np.zeros((1000, 3))
@@ -496,7 +505,7 @@ def test_what_is_not_used_is_not_shown_in_green():
     )
     green = []
     for used in (True, False):
-        (shown,) = cut_alike([JudgedPicture(picture, used)])
+        (shown,) = cut_alike([picture], [used])
         data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))

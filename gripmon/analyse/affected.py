@@ -15,9 +15,10 @@ import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from gripmon.analyse.content import COVERAGE, AffectedRange, Displacement, Event, Integrity, Limits
+from gripmon.analyse.content import AffectedRange, Displacement, Event, Integrity, Limits
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS, Track, displacement
+from gripmon.analyse.words import COVERAGE
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Array
 from gripmon.record.recordings import Recording
@@ -35,61 +36,64 @@ _MEANING = {
 }
 
 
-def motion_ranges(
-    track: Track, keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
-) -> list[AffectedRange]:
-    """When a calibration didn't hold: the one from the beginning and, if that was replaced, the one in force.
-
-    ``keys``: id and revision of the references, as indexed by ``track.reference``.
-    """
+def motion_ranges(track: Track, events: Sequence[Event], limits: Limits) -> list[AffectedRange]:
+    """When a calibration didn't hold: the one from the beginning and, if that was replaced, the one in force."""
     if not track.measured.any():
         return []
-    onsets = [event.onset.stamp_ns for event in events if event.kind in MOTIONS]
-    moved = track.stamp_ns >= min(onsets, default=np.iinfo(np.int64).max)
+    motions = [event for event in events if event.kind in MOTIONS]
     kinds = [("old_calibration", track.against_first, np.zeros(len(track), np.int64))]
-    if len(keys) > 1:
+    if len(track.keys) > 1:
         kinds.append(("stale_reference", track.against_reference, track.reference))
+    begun_ns = min((event.onset.stamp_ns for event in motions), default=np.iinfo(np.int64).max)
     out: list[AffectedRange] = []
     for what, vectors, reference in kinds:
         before_ns = 0
-        for run in _past(track, vectors, limits, reference, moved):
-            each = _motion_range(what, track, vectors, run, keys[int(reference[run[0]])], events)
+        for first, last in _past(track, vectors, limits, reference, track.stamp_ns >= begun_ns):
+            limit_ns = int(track.stamp_ns[first])
+            causes_ns = [
+                event.onset.stamp_ns
+                for event in motions
+                if event.onset.stamp_ns <= limit_ns <= (event.end_ns or limit_ns) + SECOND_NS
+            ]
             # If one motion causes two ranges, only the first begins with the motion.
-            if each.start_ns < before_ns and each.limit_ns is not None:
-                each = msgspec.structs.replace(each, start_ns=each.limit_ns)
-            out.append(each)
-            before_ns = each.end_ns
+            start_ns = min([limit_ns, *(at_ns for at_ns in causes_ns[-1:] if at_ns >= before_ns)])
+            following = track.reference[last + 1 : last + 2]
+            renewed = what == "stale_reference" and (following != track.reference[first]).any()
+            out.append(
+                msgspec.structs.replace(
+                    _range(track, what, "recalibration" if renewed else "return", reference, first, last, start_ns),
+                    limit_ns=limit_ns,
+                    largest=_largest(track, vectors, first, last),
+                )
+            )
+            before_ns = out[-1].end_ns
     return out
 
 
-def verdict_ranges(
-    track: Track, names: Sequence[str], verdict: NDArray[np.int8], keys: Sequence[tuple[str, int]]
-) -> list[AffectedRange]:
+def verdict_ranges(track: Track, table: FrameTable) -> list[AffectedRange]:
     """When transforms were suspect or missing, for a tenth of a second or more."""
     out = []
     for name in ("suspect", "unknown"):
-        for part in runs_of_equal(verdict == names.index(name)):
-            first, last = part.start, part.stop - 1
-            if verdict[first] != names.index(name):
-                continue
-            open_end = last + 1 >= len(track)
-            end_ns = int(track.stamp_ns[last if open_end else last + 1])
-            if end_ns - int(track.stamp_ns[first]) < _SHORTEST_NS:
-                continue
-            reference_id, revision = keys[int(track.reference[first])]
-            out.append(
-                AffectedRange(
-                    what=name,
-                    start_ns=int(track.stamp_ns[first]),
-                    end_ns=end_ns,
-                    ended_by="end_of_recording" if open_end else "measured_again",
-                    reference_id=reference_id,
-                    revision=revision,
-                    frames=last - first + 1,
-                    meaning=_MEANING[name],
-                )
-            )
+        mine = table.verdict == table.VERDICTS.index(name)
+        for part in runs_of_equal(mine):
+            if mine[part.start]:
+                start_ns = int(track.stamp_ns[part.start])
+                each = _range(track, name, "measured_again", track.reference, part.start, part.stop - 1, start_ns)
+                out += [each] if each.end_ns - start_ns >= _SHORTEST_NS else []
     return out
+
+
+def _range(
+    track: Track, what: str, ended_by: str, reference: NDArray[np.int64], first: int, last: int, start_ns: int
+) -> AffectedRange:
+    """The frames from ``first`` to ``last``, and the time until the next one."""
+    at_end = last >= len(track) - 1
+    reference_id, revision = track.keys[int(reference[first])]
+    return AffectedRange(
+        what=what, start_ns=start_ns, limit_ns=None, end_ns=int(track.stamp_ns[last if at_end else last + 1]),
+        ended_by="end_of_recording" if at_end else ended_by, reference_id=reference_id, revision=revision,
+        frames=last - first + 1, meaning=_MEANING[what],
+    )  # fmt: skip
 
 
 def _past(
@@ -134,33 +138,6 @@ def runs_of_equal(values: NDArray[np.int64] | NDArray[np.bool_]) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(cuts) if b > a]
 
 
-def _motion_range(
-    what: str, track: Track, vectors: Array, run: tuple[int, int], key: tuple[str, int], events: Sequence[Event]
-) -> AffectedRange:
-    first, last = run
-    limit_ns = int(track.stamp_ns[first])
-    begun = [
-        event.onset.stamp_ns
-        for event in events
-        if event.kind in MOTIONS and event.onset.stamp_ns <= limit_ns <= (event.end_ns or limit_ns) + SECOND_NS
-    ]
-    at_end = last >= len(track) - 1
-    renewed = not at_end and track.reference[last + 1] != track.reference[first]
-    ended_by = "end_of_recording" if at_end else "recalibration" if renewed and what == "stale_reference" else "return"
-    return AffectedRange(
-        what=what,
-        start_ns=min([limit_ns, *begun[-1:]]),
-        limit_ns=limit_ns,
-        end_ns=int(track.stamp_ns[min(last + 1, len(track) - 1)]),
-        ended_by=ended_by,
-        reference_id=key[0],
-        revision=key[1],
-        frames=last - first + 1,
-        largest=_largest(track, vectors, first, last),
-        meaning=_MEANING[what],
-    )
-
-
 def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacement:
     """The largest of the medians over a few frames each, robust against single outliers."""
     frames = first + np.flatnonzero(track.measured[first : last + 1])
@@ -180,17 +157,13 @@ def limits_of(source: Recording, affected_m: float | None, affected_rad: float |
     policy, origin = _policy(source)
     if affected_m is not None or affected_rad is not None:
         origin += "; what counts as affected was given with the command"
+    names = ("warn_m", "warn_rad", "limit_m", "limit_rad", "alert_limit_m", "alert_limit_rad")
     return Limits(
         affected_m=policy.warn_m if affected_m is None else affected_m,
         affected_rad=policy.warn_rad if affected_rad is None else affected_rad,
-        warn_m=policy.warn_m,
-        warn_rad=policy.warn_rad,
-        limit_m=policy.limit_m,
-        limit_rad=policy.limit_rad,
-        alert_limit_m=policy.alert_limit_m,
-        valid_by=policy.valid_by.value,
-        alert_limit_rad=policy.alert_limit_rad,
         origin=origin,
+        valid_by=policy.valid_by.value,
+        **{name: getattr(policy, name) for name in names},
     )
 
 

@@ -4,6 +4,7 @@ them.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
@@ -13,9 +14,7 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import csv
 
 from gripmon.analyse.build import AnalysedRecording, build
 from gripmon.analyse.content import Report
@@ -147,23 +146,23 @@ def _targets(out: Path, runs: int) -> list[Path]:
 
 def _stamps(path: Path) -> NDArray[np.int64]:
     """The column ``stamp_ns`` of a CSV file."""
-    options = csv.ConvertOptions(include_columns=["stamp_ns"], column_types={"stamp_ns": pa.string()})
-    try:
-        texts = csv.read_csv(path, convert_options=options)["stamp_ns"].to_pylist()
-    except KeyError:
-        right = "a first line with the columns' names, capture times in Unix ns"
-        raise InputError(f"{path}: has no column stamp_ns; {right}", "stamps") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})", "stamps") from None
     stamps = []
-    for number, text in enumerate(texts, 2):
-        try:
-            stamps.append(np.int64(int(text)))
-        except (ValueError, OverflowError):
-            wrong = f"line {number}: '{text}' is not a capture time; a whole number, Unix ns"
-            raise InputError(f"{path}: {wrong}", "stamps") from None
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.DictReader(file)
+            if "stamp_ns" not in (rows.fieldnames or ()):
+                right = "a first line with the columns' names, capture times in Unix ns"
+                raise InputError(f"{path}: has no column stamp_ns; {right}", "stamps")
+            for row in rows:
+                try:
+                    stamps.append(np.int64(int(row["stamp_ns"] or "")))
+                except (ValueError, OverflowError):
+                    wrong = f"line {rows.line_num}: '{row['stamp_ns']}' is not a capture time"
+                    raise InputError(f"{path}: {wrong}; a whole number, Unix ns", "stamps") from None
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})", "stamps") from None
     if not stamps:
-        raise InputError(f"{path}: holds no capture times", "stamps")
+        raise InputError(f"{path}: holds no capture times; a line for each", "stamps")
     return np.array(stamps, np.int64)
 
 

@@ -65,22 +65,39 @@ def outlier_frames(run: Run) -> Bools:
     return out
 
 
-def find(run: Run) -> list[FoundChange]:
-    """The change points among the usable frames, in order; a gap before a change is part of its interval."""
+def find(run: Run) -> tuple[list[FoundChange], list[FoundChange]]:
+    """The change points among the usable frames, in order; and those that are undecided: by no more than two
+    backgrounds may differ, so that it was the pose or the background.  A gap before one is part of its interval.
+    """
     good = np.flatnonzero(run.usable)
     y = run.y[good]
-    chance = FALSE_ALARMS_PER_HOUR * run.frame_s / 3600.0
-    limit = float(6 * stats.f.isf(chance, 6, MEAN_DOF))
+    limit = float(6 * stats.f.isf(_chance(run), 6, MEAN_DOF))
     peaks, _ = signal.find_peaks(squared_changes(y), height=limit, distance=2 * SIDE_FRAMES)
-    # The difference of two normal errors, as seldom, should every frame have a background of its own.
-    least = 2.0 * float(stats.chi2.isf(chance, 6))
     places = sorted((_place(y, peak) for peak in peaks.tolist()), key=lambda place: place.index)
     found: list[FoundChange] = []
+    undecided: list[FoundChange] = []
+    before = -SIDE_FRAMES
     for place in places:
-        apart = not found or place.index - found[-1].index >= SIDE_FRAMES
-        if apart and float((_jump(y, place.index) ** 2).sum()) > least:
-            found.append(place)
-    return [FoundChange(*good[[place.index, place.first, place.last]].tolist()) for place in found]
+        if place.index - before < SIDE_FRAMES:
+            continue
+        change = FoundChange(*good[[place.index, place.first, place.last]].tolist())
+        if float((_jump(y, place.index) ** 2).sum()) > largest_background_change(run):
+            found.append(change)
+            before = place.index
+        else:
+            undecided.append(change)
+    return found, undecided
+
+
+def _chance(run: Run) -> float:
+    return FALSE_ALARMS_PER_HOUR * run.frame_s / 3600.0
+
+
+def largest_background_change(run: Run) -> float:
+    """Squared difference of two normal errors, in reported variances, that is as seldom as a false alarm, should every
+    frame have a background of its own.
+    """
+    return 2.0 * float(stats.chi2.isf(_chance(run), 6))
 
 
 def _jump(y: Array, index: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -10,8 +11,19 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon.analyse.content import count
-from gripmon.model.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
+from gripmon.analyse.words import count
+from gripmon.model.records import (
+    Alert,
+    AlertEvent,
+    AlertKind,
+    Array,
+    FrameRecord,
+    Origin,
+    Severity,
+    Smoothed,
+    Transform,
+    Verdict,
+)
 from gripmon.model.units import in_mm
 from gripmon.simulate import FrameTruth
 
@@ -107,34 +119,40 @@ class Comparison(msgspec.Struct, frozen=True):
         ]
 
 
+class _AlertChanges:
+    """What each alert changes: an alert begins, becomes another, or is over."""
+
+    def __init__(self) -> None:
+        self._open: dict[str, tuple[AlertKind, Severity]] = {}
+
+    def of(self, alert: Alert) -> tuple[str, bool]:
+        """In words, empty if it changes nothing; and whether it is an alarm: a fault that is new, or is worse now."""
+        if alert.event is AlertEvent.CLEARED:
+            self._open.pop(alert.alert_id, None)
+            return f"{alert.kind} cleared", False
+        fault = alert.kind not in NO_ALARMS
+        if alert.event is AlertEvent.NOTED:
+            return f"{alert.kind} ({alert.severity})", fault and alert.severity is not Severity.INFO
+        before, now = self._open.get(alert.alert_id), (alert.kind, alert.severity)
+        self._open[alert.alert_id] = now
+        if before == now:
+            return "", False
+        ranks = list(Severity)
+        worse = before is None or before[0] is not now[0] or ranks.index(now[1]) > ranks.index(before[1])
+        how = "raised as" if alert.event is AlertEvent.RAISED else "becomes"
+        return f"{alert.kind} {how} {alert.severity}", fault and worse
+
+
 class _Pair(NamedTuple):
     record: FrameRecord
     truth: FrameTruth
     alarm: bool
 
-
-class _Alarms:
-    """Separates alarms from other alerts, which say that something is over or continues."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, tuple[AlertKind, Severity]] = {}
-
-    def among(self, alerts: Iterable[Alert]) -> bool:
-        """Whether alerts of one frame report a new fault, or one that changed its kind or became more severe."""
-        alarms = [self._is_one(alert) for alert in alerts]  # all of them must be evaluated
-        return any(alarms)
-
-    def _is_one(self, alert: Alert) -> bool:
-        before = self._known.get(alert.alert_id)
-        if alert.event is AlertEvent.CLEARED or alert.kind in NO_ALARMS:
-            return False
-        if alert.event is AlertEvent.NOTED:
-            return alert.severity is not Severity.INFO
-        self._known[alert.alert_id] = (alert.kind, alert.severity)
-        if before is None:
-            return True
-        ranks = list(Severity)
-        return alert.kind is not before[0] or ranks.index(alert.severity) > ranks.index(before[1])
+    def error_m(self, pose: Transform | Smoothed | None) -> Array | None:
+        """Error (3,) of the TCP in camera axes; None where there is no pose, or one that no controller would use."""
+        if pose is None or self.record.verdict is not Verdict.VALID:
+            return None
+        return np.array(pose.translation_m) - self.truth.cam_T_grip[:3, 3]
 
 
 def compare(records: Iterable[FrameRecord], truth_of: Callable[[int], FrameTruth]) -> Comparison:
@@ -142,16 +160,17 @@ def compare(records: Iterable[FrameRecord], truth_of: Callable[[int], FrameTruth
 
     ``after_correction`` and ``smoothed`` are over the frames whose verdict is valid: those that a controller would use.
     """
-    alarms = _Alarms()
-    pairs = [_Pair(record, truth_of(record.seq), alarms.among(record.alerts)) for record in records]
-    valid = [pair for pair in pairs if pair.record.verdict is Verdict.VALID]
-    verdicts = {verdict.value: sum(p.record.verdict is verdict for p in pairs) for verdict in Verdict}
+    changes = _AlertChanges()
+    pairs = []
+    for record in records:
+        alarms = [changes.of(alert)[1] for alert in record.alerts]  # all of them must be evaluated
+        pairs.append(_Pair(record, truth_of(record.seq), any(alarms)))
     return Comparison(
         frames=len(pairs),
-        verdicts=verdicts,
+        verdicts={verdict.value: sum(p.record.verdict is verdict for p in pairs) for verdict in Verdict},
         without_correction=_errors([p.truth.tcp_shift_m for p in pairs]),
-        after_correction=_errors([error for p in valid if (error := _error(p)) is not None]),
-        smoothed=_errors([error for p in valid if (error := _smoothed_error(p)) is not None]),
+        after_correction=_corrected(pairs),
+        smoothed=_errors([p.error_m(p.record.smoothed) for p in pairs]),
         events=_events(pairs),
     )
 
@@ -163,21 +182,13 @@ def distribution(values: Array) -> Distribution:
     return Distribution(float(values.mean()), float(np.percentile(values, 95.0)), float(values.max()))
 
 
-def _error(pair: _Pair) -> Array | None:
-    """Error (3,) of the TCP in camera axes, m; None for a frame without a measurement of its own."""
-    if pair.record.measured_T is None or pair.record.source is Origin.HELD:
-        return None
-    return np.array(pair.record.measured_T.translation_m) - pair.truth.cam_T_grip[:3, 3]
+def _corrected(pairs: Iterable[_Pair]) -> TcpErrors:
+    """Of the frames with a measurement of their own."""
+    return _errors([p.error_m(None if p.record.source is Origin.HELD else p.record.measured_T) for p in pairs])
 
 
-def _smoothed_error(pair: _Pair) -> Array | None:
-    if pair.record.smoothed is None:
-        return None
-    return np.array(pair.record.smoothed.translation_m) - pair.truth.cam_T_grip[:3, 3]
-
-
-def _errors(errors_m: Sequence[Array]) -> TcpErrors:
-    errors_mm = 1e3 * np.array(errors_m, dtype=float).reshape(-1, 3)
+def _errors(errors_m: Sequence[Array | None]) -> TcpErrors:
+    errors_mm = 1e3 * np.array([e for e in errors_m if e is not None], dtype=float).reshape(-1, 3)
     across_mm = np.hypot(errors_mm[:, 0], errors_mm[:, 1])
     return TcpErrors(len(errors_mm), distribution(across_mm), distribution(np.abs(errors_mm[:, 2])))
 
@@ -186,32 +197,33 @@ def _events(pairs: list[_Pair]) -> tuple[EventReport, ...]:
     """One report per uninterrupted period of a label, ending where the next event begins: each frame counts once."""
     spans: list[tuple[int, int, str]] = []
     for label, name in EVENT_NAMES.items():
-        active = [label in pair.truth.events for pair in pairs]
-        starts = [i for i, on in enumerate(active) if on and (i == 0 or not active[i - 1])]
-        spans += [(i, next((k for k in range(i, len(pairs)) if not active[k]), len(pairs)), name) for i in starts]
+        active = np.array([label in pair.truth.events for pair in pairs], bool)
+        edges = np.flatnonzero(np.diff(active, prepend=False, append=False)).tolist()
+        spans += [(start, end, name) for start, end in zip(edges[::2], edges[1::2], strict=True)]
     spans.sort()
     following = [start for start, _, _ in spans[1:]] + [len(pairs)]
-    origin_s = pairs[0].truth.time_s if pairs else 0.0
     return tuple(
-        _event_report(name, pairs[start : min(end, limit)], pairs[start:limit], origin_s)
+        _event_report(name, pairs, start, min(end, limit), limit)
         for (start, end, name), limit in zip(spans, following, strict=True)
         if start < limit
     )
 
 
-def _event_report(name: str, during: list[_Pair], until_next: list[_Pair], origin_s: float) -> EventReport:
-    valid = [pair for pair in during if pair.record.verdict is Verdict.VALID]
+def _event_report(name: str, pairs: list[_Pair], start: int, end: int, limit: int) -> EventReport:
+    """Of the frames up to ``end``; what happens up to ``limit`` is due to it."""
+    during, until_next = pairs[start:end], pairs[start:limit]
+    begin_s, origin_s = during[0].truth.time_s, pairs[0].truth.time_s
     noticed = next((pair for pair in until_next if pair.alarm), None)
     return EventReport(
         event=name,
-        start_s=during[0].truth.time_s - origin_s,
+        start_s=begin_s - origin_s,
         end_s=during[-1].truth.time_s - origin_s,
         frames=len(during),
-        valid=len(valid),
+        valid=sum(pair.record.verdict is Verdict.VALID for pair in during),
         harmless=name in HARMLESS,
         largest_tcp_shift_mm=1e3 * max(float(np.linalg.norm(p.truth.tcp_shift_m)) for p in during),
-        after_correction=_errors([error for p in valid if (error := _error(p)) is not None]),
-        noticed_after_s=None if noticed is None else noticed.truth.time_s - during[0].truth.time_s,
+        after_correction=_corrected(during),
+        noticed_after_s=None if noticed is None else noticed.truth.time_s - begin_s,
         alerts=tuple(_in_short(alert) for p in until_next for alert in p.record.alerts),
     )
 
@@ -222,84 +234,63 @@ def _in_short(alert: Alert) -> str:
 
 
 _MOST_SHOWN = 3
+_Seqs = defaultdict[str, list[int]]
+"""Frame numbers of each change of an alert."""
 
 
 class Differences:
     """The differences between a recorded run and its replay, counted frame by frame."""
 
     def __init__(self) -> None:
-        self.frames = 0
-        self._same = self._verdicts = self._states = 0
-        self._first: dict[str, str] = {}
+        self.frames = self._other_numbers = 0
+        self._judged: dict[str, list[str]] = {"verdict": [], "state": []}
         self._largest_m = 0.0
-        self._alerts_then, self._alerts_now = _AlertChanges(), _AlertChanges()
+        self._changes = _AlertChanges(), _AlertChanges()
+        self._alerts: tuple[_Seqs, _Seqs] = defaultdict(list), defaultdict(list)
 
     def add(self, then: FrameRecord, now: FrameRecord) -> None:
         """The same frame, as it was recorded and as it is replayed."""
         self.frames += 1
-        self._same += msgspec.structs.replace(then, latency_ns=now.latency_ns) == now
-        for what in ("verdict", "state"):
+        self._other_numbers += msgspec.structs.replace(then, latency_ns=now.latency_ns) != now
+        for what, differing in self._judged.items():
             before, after = getattr(then, what), getattr(now, what)
             if before is not after:
-                self._first.setdefault(what, f"frame {now.seq}, {after} instead of {before}")
-        self._verdicts += then.verdict is not now.verdict
-        self._states += then.state is not now.state
+                differing.append(f"frame {now.seq}, {after} instead of {before}")
         if then.cam_T_grip is not None and now.cam_T_grip is not None:
-            self._largest_m = max(
-                self._largest_m, math.dist(now.cam_T_grip.translation_m, then.cam_T_grip.translation_m)
-            )
-        self._alerts_then.add(then.seq, then.alerts)
-        self._alerts_now.add(now.seq, now.alerts)
+            away_m = math.dist(now.cam_T_grip.translation_m, then.cam_T_grip.translation_m)
+            self._largest_m = max(self._largest_m, away_m)
+        for record, changes, seqs in zip((then, now), self._changes, self._alerts, strict=True):
+            for alert in record.alerts:
+                if what := changes.of(alert)[0]:
+                    seqs[what].append(record.seq)
 
     def text(self, from_jpeg: bool) -> str:
         """``from_jpeg``: the replayed images were compressed as JPEG, which changes every number."""
-        if self._same == self.frames:
+        if not self._other_numbers:
             return f"all {self.frames} as they were recorded, every number the same"
-        alerts = self._alerts_now.against(self._alerts_then)
         judged = [
-            f"{count(number, 'frame')} with another {what} (the first: {self._first[what]})"
-            for what, number in (("verdict", self._verdicts), ("state", self._states))
-            if number
+            f"{count(len(differing), 'frame')} with another {what} (the first: {differing[0]})"
+            for what, differing in self._judged.items()
+            if differing
         ]
-        if alerts:
-            judged = [*(judged or ["verdicts and states as recorded"]), f"alerts differ: {alerts}"]
+        if alerts := self._other_alerts():
+            more = f" and {len(alerts) - _MOST_SHOWN} more" if len(alerts) > _MOST_SHOWN else ""
+            judged = judged or ["verdicts and states as recorded"]
+            judged.append(f"alerts differ: {', '.join(alerts[:_MOST_SHOWN])}{more}")
         same = f"verdicts, states and alerts of all {self.frames} frames as recorded"
-        numbers = f"numbers differ in {self.frames - self._same}, the TCP by up to {in_mm(self._largest_m)} mm"
-        why = " (the images were recorded as JPEG)" if from_jpeg else ""
-        return f"{'; '.join(judged) or same}; {numbers}{why}"
+        numbers = f"numbers differ in {self._other_numbers}, the TCP by up to {in_mm(self._largest_m)} mm"
+        return f"{'; '.join(judged) or same}; {numbers}{' (the images were recorded as JPEG)' if from_jpeg else ''}"
 
-
-class _AlertChanges:
-    """When alerts began, ended, or changed severity, by kind and change."""
-
-    def __init__(self) -> None:
-        self._severity: dict[str, str] = {}  # of open alerts, by id
-        self._at: defaultdict[str, list[int]] = defaultdict(list)
-
-    def add(self, seq: int, alerts: tuple[Alert, ...]) -> None:
-        for alert in alerts:
-            known = self._severity.get(alert.alert_id)
-            if alert.event == "cleared":
-                self._severity.pop(alert.alert_id, None)
-                self._at[f"{alert.kind} cleared"].append(seq)
-            elif alert.event == "noted":
-                self._at[f"{alert.kind} ({alert.severity})"].append(seq)
-            elif known != alert.severity:
-                self._severity[alert.alert_id] = alert.severity
-                change = "raised as" if alert.event == "raised" else "becomes"
-                self._at[f"{alert.kind} {change} {alert.severity}"].append(seq)
-
-    def against(self, then: _AlertChanges) -> str:
-        """What is additional, missing, or at another frame than then, in words; empty if nothing."""
+    def _other_alerts(self) -> list[str]:
+        """What is additional, missing, or at another frame, in words and order; of each kind the first."""
+        then, now = self._alerts
         texts = []
-        for what in sorted({*self._at, *then._at}, key=lambda w: ((self._at.get(w) or then._at[w])[0], w)):
-            now_at, then_at = self._at.get(what, []), then._at.get(what, [])
-            if len(now_at) > len(then_at):
-                texts.append(f"{what} at frame {now_at[len(then_at)]}, not recorded")
-            elif len(now_at) < len(then_at):
-                texts.append(f"no {what}, recorded at frame {then_at[len(now_at)]}")
-            elif now_at != then_at:
-                now_seq, then_seq = next(pair for pair in zip(now_at, then_at, strict=True) if pair[0] != pair[1])
-                texts.append(f"{what} at frame {now_seq}, recorded at {then_seq}")
-        more = len(texts) - _MOST_SHOWN
-        return ", ".join(texts[:_MOST_SHOWN]) + (f" and {more} more" if more > 0 else "")
+        for what in {**now, **then}:
+            pairs = itertools.zip_longest(now.get(what, ()), then.get(what, ()))
+            now_seq, then_seq = next((pair for pair in pairs if pair[0] != pair[1]), (None, None))
+            if now_seq is not None:
+                recorded = "not recorded" if then_seq is None else f"recorded at {then_seq}"
+                texts.append((now_seq, f"{what} at frame {now_seq}, {recorded}"))
+            elif then_seq is not None:
+                texts.append((then_seq, f"no {what}, recorded at frame {then_seq}"))
+        return [text for _, text in sorted(texts)]

@@ -1,25 +1,47 @@
-"""A report as data, as ``gripmon report --json`` writes it and the page shows it, and the formatting of its numbers and
-times for people: millimetres, degrees, UTC.
+"""A report as data, as ``gripmon report --json`` writes it and the page shows it.
 
-SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.
+SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.  A field
+that people see in a table says here how it is called, what it means and how its value is worded (:func:`facts`).
 """
 
 from __future__ import annotations
 
-import math
-from datetime import UTC, datetime
-from typing import Annotated
+import typing
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
+from gripmon.analyse.words import degrees, duration, millimetres, percent, rate
 from gripmon.model.records import CauseWeight
+from gripmon.record.table import COLUMNS
 
 Vector = tuple[float, float, float]
 
 
-def _is(description: str) -> Meta:
-    return Meta(description=description)
+def _is(description: str, name: str | None = None, words: Callable[[Any], str] = str) -> Meta:
+    """``name``: how people call the field, which then is a fact; ``words``: of its value."""
+    return Meta(title=name, description=description, extra=None if name is None else {"words": words})
+
+
+class Fact(NamedTuple):
+    """A field for people: its name, its value in words with the unit, and what it is."""
+
+    name: str
+    text: str
+    help: str
+
+
+def facts(of: msgspec.Struct) -> list[Fact]:
+    """The fields of a struct that have a name and a value, in order."""
+    out = []
+    for field, hint in typing.get_type_hints(type(of), include_extras=True).items():
+        value = getattr(of, field)
+        about = next((each for each in getattr(hint, "__metadata__", ()) if each.title is not None), None)
+        if about is not None and value is not None:
+            out.append(Fact(about.title, about.extra["words"](value), about.description))
+    return out
 
 
 class Displacement(msgspec.Struct, frozen=True):
@@ -32,6 +54,15 @@ class Displacement(msgspec.Struct, frozen=True):
     ]
     rotation_rad: Annotated[float | None, _is("turn, rad; null: not known")]
     rotation_sigma_rad: Annotated[float | None, _is("standard deviation of rotation_rad, likewise")] = None
+
+
+def size(moved: Displacement | None) -> str:
+    """Shift and turn of a displacement."""
+    if moved is None:
+        return "–"
+    shift = millimetres(moved.size_m, moved.sigma_m)
+    turn = "" if moved.rotation_rad is None else f", {degrees(moved.rotation_rad, moved.rotation_sigma_rad)}"
+    return shift + turn
 
 
 class Onset(msgspec.Struct, frozen=True):
@@ -122,13 +153,27 @@ class Integrity(msgspec.Struct, frozen=True, kw_only=True):
     """How large errors may have been, frame by frame, and how often that was within the alert limits."""
 
     frames: Annotated[int, _is("that have bounds: those with a transform")]
-    valid: Annotated[float, _is("share of all frames, missing ones too, whose transform was valid, 0 to 1")]
-    within: Annotated[float, _is("share of all frames, likewise, with both bounds within the alert limits, 0 to 1")]
-    median_m: Annotated[float, _is("median of the bounds on the TCP's position error")]
-    p99_m: Annotated[float, _is("99 % of them are at most that")]
-    median_rad: Annotated[float, _is("median of the bounds on the rotation error")]
-    p99_rad: float
-    risk: Annotated[float, _is("probability per frame that the error exceeds a bound")]
+    valid: Annotated[
+        float,
+        _is(
+            "share of all frames, missing ones too, whose transform was valid, 0 to 1", "Valid, of all frames", percent
+        ),
+    ]
+    within: Annotated[
+        float,
+        _is(
+            "share of all frames, likewise, with both bounds within the alert limits, 0 to 1",
+            "Bounds within the alert limits",
+            percent,
+        ),
+    ]
+    median_m: Annotated[
+        float, _is("median of the bounds on the TCP's position error", "Protection level, median", millimetres)
+    ]
+    p99_m: Annotated[float, _is("99 % of them are at most that", "Protection level, 99 %", millimetres)]
+    median_rad: Annotated[float, _is("median of the bounds on the rotation error", "Of the rotation, median", degrees)]
+    p99_rad: Annotated[float, _is("99 % of them are at most that", "Of the rotation, 99 %", degrees)]
+    risk: Annotated[float, _is(COLUMNS["integrity_risk"].help)]
 
 
 class Noise(msgspec.Struct, frozen=True):
@@ -191,19 +236,25 @@ class Curve(msgspec.Struct, frozen=True):
 class Running(msgspec.Struct, frozen=True, kw_only=True):
     """How the monitor ran."""
 
-    frames: int
-    frames_dropped: Annotated[int, _is("numbers missing between the first frame and the last")]
+    frames: Annotated[int, _is("frames in the recording", "Recorded")]
+    frames_dropped: Annotated[int, _is("numbers missing between the first frame and the last", "Missing")]
     dropped: Annotated[
         tuple[str, ...], _is("where frames are missing that were not recorded; damage is among the faults")
     ]
-    frames_refused: Annotated[int, _is("that couldn't be measured")]
-    monitor_dropped: Annotated[int | None, _is("of these those that it had no time for; null: not recorded")]
-    recording_dropped: Annotated[int | None, _is("that the recorder had no time for; null: not recorded")]
-    frames_per_s: Annotated[float | None, _is("median rate; null with less than two frames")]
-    gaps: Annotated[int, _is("pauses of more than a second")]
+    frames_refused: Annotated[int, _is("that couldn't be measured", "Not measured")]
+    monitor_dropped: Annotated[
+        int | None,
+        _is("of the missing those that it had no time for; null: not recorded", "Skipped because the monitor was busy"),
+    ]
+    recording_dropped: Annotated[
+        int | None,
+        _is("that the recorder had no time for; null: not recorded", "Skipped because the recorder was busy"),
+    ]
+    frames_per_s: Annotated[float | None, _is("median rate; null with less than two frames", "Rate", rate)]
+    gaps: Annotated[int, _is("pauses of more than a second", "Pauses")]
     longest_gap_s: float
-    latency_median_s: float | None
-    latency_p99_s: float | None
+    latency_median_s: Annotated[float | None, _is(COLUMNS["latency_ns"].help, "Latency, median", duration)]
+    latency_p99_s: Annotated[float | None, _is("99 % of the frames took at most that", "Latency, 99 %", duration)]
     noise: Annotated[Noise | None, _is("null: too few frames without motion")]
     verdicts: tuple[Share, ...]
     states: tuple[Share, ...]
@@ -257,6 +308,15 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
     references: tuple[ReferenceEntry, ...]
     commands: tuple[CommandEntry, ...]
     faults: Annotated[tuple[str, ...], _is("what of it could not be used, a line each")]
+    missable_m: Annotated[
+        float | None,
+        _is(
+            "a step of the TCP without an alert may be missing among the events up to that size, since two backgrounds "
+            "may differ by it; null: not known",
+            "Steps may be missing up to",
+            millimetres,
+        ),
+    ] = None
     integrity: Annotated[
         Integrity | None, _is("null: the version that recorded it stated no bounds, or nothing was measured")
     ] = None
@@ -269,114 +329,3 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
     version: Annotated[str, _is("of gripmon, which made the report")]
     recordings: tuple[RecordingReport, ...]
     faults: Annotated[tuple[str, ...], _is("files that could not be used at all, a line each")]
-
-
-COVERAGE = 2.0
-"""Standard deviations of a frame's noise that count as significant and make the curves' bands."""
-
-
-_FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
-
-
-def clock_time(stamp_ns: int, digits: int = 1) -> str:
-    """``12:34:56.7``, UTC, truncated, so that no time is shown after the event."""
-    whole, part = divmod(stamp_ns, 1_000_000_000)
-    return f"{_at(whole):%H:%M:%S}" + (f".{part:09d}"[: digits + 1] if digits else "")
-
-
-def date(stamp_ns: int) -> str:
-    """``2026-11-21``, UTC."""
-    return f"{_at(stamp_ns // 1_000_000_000):%Y-%m-%d}"
-
-
-def period(start_ns: int, end_ns: int) -> str:
-    """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is not a date."""
-    times = f"{clock_time(start_ns, 0)} to {clock_time(end_ns, 0)}"
-    if 0 <= start_ns < _FIRST_YEAR_NS:
-        return f"{times} by a clock that began with the images, or with 1970"
-    return f"{date(start_ns)}, {times} UTC"
-
-
-def iso(stamp_ns: int) -> str:
-    """``2026-11-21T12:34:56.789Z``."""
-    return f"{date(stamp_ns)}T{clock_time(stamp_ns, 3)}Z"
-
-
-def _at(seconds: int) -> datetime:
-    """Years outside the calendar are clipped to it."""
-    return datetime.fromtimestamp(min(max(seconds, -62_135_596_800), 253_402_300_799), UTC)
-
-
-def duration(seconds: float) -> str:
-    """A duration in the two units that fit."""
-    if seconds < 0.0995:
-        return f"{1e3 * seconds:.0f} ms"
-    if seconds < 59.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    minutes = round(seconds / 60.0)
-    if minutes < 1440:
-        return f"{minutes // 60} h {minutes % 60} min"
-    hours = round(seconds / 3600.0)
-    return f"{hours // 24} d {hours % 24} h"
-
-
-def span(start_ns: int, end_ns: int) -> str:
-    """How long from one time to another."""
-    return duration(1e-9 * (end_ns - start_ns))
-
-
-def millimetres(metres: float, sigma_m: float | None = None) -> str:
-    """``4.21 mm``: two standard deviations of the frames' noise determine the digits.  They aren't shown as ±: light
-    and bevels, which they leave out, may shift a measurement by more.
-    """
-    if not math.isfinite(metres):
-        return "unknown"
-    return f"{_measured(1e3 * metres, None if sigma_m is None else 1e3 * sigma_m)} mm"
-
-
-def degrees(radians: float | None, sigma_rad: float | None = None) -> str:
-    """``1.63°``, digits as :func:`millimetres`."""
-    if radians is None or not math.isfinite(radians):
-        return "unknown"
-    sigma = None if sigma_rad is None else math.degrees(sigma_rad)
-    return f"{_measured(math.degrees(radians), sigma)}°"
-
-
-def size(moved: Displacement | None) -> str:
-    """Shift and turn of a displacement."""
-    if moved is None:
-        return "–"
-    text = millimetres(moved.size_m, moved.sigma_m)
-    if moved.rotation_rad is None:
-        return text
-    return f"{text}, {degrees(moved.rotation_rad, moved.rotation_sigma_rad)}"
-
-
-def signed_mm(values_m: tuple[float, float, float]) -> str:
-    """``+1.178 +0.389 +0.040``."""
-    return " ".join(f"{1e3 * value:+.3f}".replace("-", "−") for value in values_m)
-
-
-def percent(share: float) -> str:
-    """Per cent; a fraction between 0 and 1 is never shown as 0 or 100 %."""
-    text = f"{100.0 * share:.1f}"
-    if text == "100.0" and share < 1.0:
-        return "> 99.9 %"
-    if text == "0.0" and share > 0.0:
-        return "< 0.1 %"
-    return f"{text.removesuffix('.0')} %"
-
-
-def count(number: int, one: str) -> str:
-    """``1 frame``, ``2 frames``."""
-    return f"{number} {one if number == 1 else one + 's'}"
-
-
-def _measured(value: float, sigma: float | None) -> str:
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0.0:
-        return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-    digits = -math.floor(math.log10(COVERAGE * sigma))  # the spread's first digit is the last one shown
-    return f"{value:.{min(max(digits, 0), 4)}f}"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,15 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
 from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR
-from gripmon.analyse.content import clock_time, count
 from gripmon.analyse.correction import SOURCES, Correction, correct, sample
 from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
+from gripmon.analyse.words import clock_time, count, millimetres
 from gripmon.model.errors import NoResultError
-from gripmon.model.records import Array, Origin, Transform
+from gripmon.model.records import Array, Origin
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
-_POSE = [f"translation_{axis}_m" for axis in "xyz"], [f"rotation_{axis}" for axis in "xyzw"]
+_MAX_SHOWN = 5
+_POSE = {
+    "translation_m": [f"translation_{axis}_m" for axis in "xyz"],
+    "rotation_xyzw": [f"rotation_{axis}" for axis in "xyzw"],
+}
+"""Columns of a pose, by its fields."""
 BETWEEN = "between"
 """Source of an instant that is not a frame's."""
 
@@ -43,7 +50,7 @@ class CorrectedRun:
         return name_of(self.recording)
 
     def summary(self) -> str:
-        """For people: number of frames, uncertainty, and one line per change point."""
+        """For people: number of frames, uncertainty, one line per change point, and what may be missing among them."""
         made = self.correction
         sigma_um = 1e6 * float(np.median(_tcp_sigma_m(made.covariance)))
         points = count(len(made.change_points), "change point")
@@ -55,6 +62,12 @@ class CorrectedRun:
             seq = int(self.recording.frames.seq[point.index])
             when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
             lines.append(f"  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°")
+        if made.undecided_ns:
+            when = ", ".join(clock_time(stamp_ns, 3) for stamp_ns in made.undecided_ns[:_MAX_SHOWN])
+            more = ", …" if len(made.undecided_ns) > _MAX_SHOWN else ""
+            lines.append(f"  at {when}{more}: the camera moved, or the background changed (σ includes both)")
+        missable = millimetres(made.missable_m)
+        lines.append(f"  steps of up to {missable} may be missing, since another background might explain them")
         return "\n".join(lines)
 
 
@@ -78,81 +91,41 @@ def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
     return correct(frames.stamp_ns, poses, frames.covariance, measured, step)
 
 
-class WrittenChangePoint(msgspec.Struct, frozen=True):
-    """``size``: x, y, z of the TCP (m) and rotation vector (rad) from before to after, camera axes."""
-
-    seq: int
-    stamp_ns: int
-    earliest_ns: int
-    latest_ns: int
-    size: tuple[float, ...]
-    size_covariance: tuple[float, ...]
-
-
-class WrittenRun(msgspec.Struct, frozen=True):
-    """A run of a monitor; ``learnt``: variances per whitened axis, in units of the reported variance."""
-
-    recording_id: str
-    robot: str
-    camera: str
-    files: tuple[str, ...]
-    frames: int
-    change_points: tuple[WrittenChangePoint, ...]
-    learnt: dict[str, tuple[float, ...]]
-    faults: tuple[str, ...]
-
-
-class Provenance(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.correction/1"):
-    """First line of the file, or metadata ``gripmon`` of the table: ``inputs`` are SHA-256 by file name."""
-
-    version: str
-    inputs: tuple[tuple[str, str], ...]
-    settings: dict[str, float]
-    runs: tuple[WrittenRun, ...]
-
-
-class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.corrected/1"):
-    """One instant.  ``run``: number of the run; ``seq``: -1 if the instant is not a frame's; ``segment``: number of
-    change points before; ``sigma_tcp_m``: standard deviation of the TCP's position, all axes together.
-    """
-
-    run: int
-    seq: int
-    stamp_ns: int
-    cam_T_grip: Transform
-    covariance: tuple[float, ...]
-    segment: int
-    source: str
-    sigma_tcp_m: float
-
-
-def _run(each: CorrectedRun) -> WrittenRun:
-    recording, made = each.recording, each.correction
-    seqs = recording.frames.seq
-    return WrittenRun(
-        recording.recording_id,
-        recording.robot,
-        recording.camera,
-        tuple(path.name for path in recording.files),
-        len(seqs),
-        tuple(
-            WrittenChangePoint(
-                int(seqs[point.index]),
-                point.stamp_ns,
-                point.earliest_ns,
-                point.latest_ns,
-                tuple(point.size.tolist()),
-                tuple(point.size_covariance.ravel().tolist()),
-            )
-            for point in made.change_points
-        ),
-        {name: tuple(values.tolist()) for name, values in made.learnt.items()},
-        (*recording.faults, *made.faults),
-    )
+def _about(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    """Where the transforms come from; of each run its change points, and what was learnt of its errors."""
+    about = {
+        "schema": "gripmon.correction/1",
+        "version": __version__,
+        "inputs": inputs,
+        "settings": {"false_alarms_per_hour": FALSE_ALARMS_PER_HOUR, "block_s": BLOCK_S, "slow_error_s": SLOW_S},
+        "runs": [
+            {
+                "recording_id": each.recording.recording_id,
+                "robot": each.recording.robot,
+                "camera": each.recording.camera,
+                "files": [path.name for path in each.recording.files],
+                "frames": len(each.recording.frames),
+                "change_points": [
+                    {"seq": int(each.recording.frames.seq[point.index]), **dataclasses.asdict(point)}
+                    for point in each.correction.change_points
+                ],
+                "undecided_ns": each.correction.undecided_ns,
+                "missable_m": each.correction.missable_m,
+                "learnt": each.correction.learnt,
+                "faults": [*each.recording.faults, *each.correction.faults],
+            }
+            for each in runs
+        ],
+    }
+    plain: dict[str, Any] = msgspec.to_builtins(about, enc_hook=lambda values: np.ravel(values).tolist())
+    return plain
 
 
 def _table(number: int, each: CorrectedRun) -> pa.Table:
-    """One run's instants."""
+    """One run's instants.  ``seq`` is -1 if one is not a frame's; ``segment``: number of change points before;
+    ``sigma_tcp_m``: standard deviation of the TCP's position, all axes together; ``covariance`` by rows, 36 (m², m rad,
+    rad²).
+    """
     made, frames = each.correction, each.recording.frames
     if each.wanted_ns is None:
         stamp_ns, seq, segment = made.stamp_ns, frames.seq, made.segment
@@ -176,8 +149,8 @@ def _table(number: int, each: CorrectedRun) -> pa.Table:
             "segment": segment,
             "source": pa.array(source.tolist(), pa.string()),
             "sigma_tcp_m": _tcp_sigma_m(covariance),
-            **{f"translation_{axis}_m": np.ascontiguousarray(poses[:, k, 3]) for k, axis in enumerate("xyz")},
-            **{f"rotation_{axis}": np.ascontiguousarray(turn[:, k]) for k, axis in enumerate("xyzw")},
+            **dict(zip(_POSE["translation_m"], np.ascontiguousarray(poses[:, :3, 3].T), strict=True)),
+            **dict(zip(_POSE["rotation_xyzw"], np.ascontiguousarray(turn.T), strict=True)),
             "covariance": pa.FixedSizeListArray.from_arrays(pa.array(covariance.reshape(-1)), 36),
         }
     )
@@ -188,19 +161,20 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
 
     ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
     """
-    part = path.with_name(f".{path.name}.part")
-    settings = {"false_alarms_per_hour": FALSE_ALARMS_PER_HOUR, "block_s": BLOCK_S, "slow_error_s": SLOW_S}
-    about = Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
+    part, about = path.with_name(f".{path.name}.part"), _about(runs, inputs)
     try:
-        if path.suffix.lower() == ".jsonl":
-            _write_jsonl(part, runs, about)
-        elif path.suffix.lower() == ".parquet":
-            _write_parquet(part, runs, about)
-        else:
+        if path.suffix.lower() == ".rrd":
             from gripmon.record.compared import write_track
 
             recording = runs[number].recording
             write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
+        elif path.suffix.lower() == ".parquet":
+            whole = pa.concat_tables([_table(k, each) for k, each in enumerate(runs)])
+            whole = whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)})
+            pq.write_table(whole, part, compression="zstd")
+        else:
+            with part.open("wb") as file:
+                file.writelines(msgspec.json.encode(line) + b"\n" for line in (about, *_lines(runs)))
         part.replace(path)
     except OSError as error:
         raise NoResultError(f"--out {path}: writing failed ({error.strerror or error})") from None
@@ -209,21 +183,10 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
             part.unlink(missing_ok=True)
 
 
-def _write_jsonl(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
-    """A :class:`Provenance`, then a :class:`CorrectedFrame` a line."""
-    encode = msgspec.json.Encoder().encode
-    with path.open("wb") as file:
-        file.write(encode(about) + b"\n")
-        for number, each in enumerate(runs):
-            for batch in _table(number, each).to_batches(4096):
-                for row in batch.to_pylist():
-                    shift, turn = ([row.pop(name) for name in names] for names in _POSE)
-                    row |= {"cam_T_grip": Transform(tuple(shift), tuple(turn)), "covariance": tuple(row["covariance"])}
-                    del row["robot"], row["camera"]
-                    file.write(encode(CorrectedFrame(**row)) + b"\n")
-
-
-def _write_parquet(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
-    """The same as a table, the covariance as a list of 36 (m², m rad, rad²), :class:`Provenance` as metadata."""
-    whole = pa.concat_tables([_table(number, each) for number, each in enumerate(runs)])
-    pq.write_table(whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)}), path, compression="zstd")
+def _lines(runs: Sequence[CorrectedRun]) -> Iterator[dict[str, Any]]:
+    """The rows of the runs' tables, one for an instant, with the pose as messages have it."""
+    for number, each in enumerate(runs):
+        for batch in _table(number, each).drop_columns(["robot", "camera"]).to_batches(4096):
+            for row in batch.to_pylist():
+                pose = {name: [row.pop(column) for column in columns] for name, columns in _POSE.items()}
+                yield {"schema": "gripmon.corrected/1", **row, "cam_T_grip": pose}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.change_points import FoundChange, find, outlier_frames
+from gripmon.analyse.change_points import FoundChange, find, largest_background_change, outlier_frames
 from gripmon.analyse.quick_motion import swings, vibration
 from gripmon.analyse.smoothing import BLOCK_S, Blocks, Smoothed, smooth_blocks
 from gripmon.analyse.vectors import Ints, Run, covariances_to_poses, prepare, to_poses, to_vectors
@@ -51,7 +51,9 @@ class Correction:
 
     ``learnt``: what was estimated from the recording, (6,) each by whitened axis in units of the reported variance:
     ``frame``, ``white`` and ``slow``, a frame's error about its block, a block's own, and the lasting one;
-    ``turn_per_s3``, the walk of the pose's rate.
+    ``turn_per_s3``, the walk of the pose's rate.  ``undecided_ns``: when the pose or the background changed, which
+    can't be told; the covariance includes both.  ``missable_m``: a step by which the TCP moves no farther may be among
+    these, or not be found at all.
     """
 
     stamp_ns: Ints
@@ -61,6 +63,8 @@ class Correction:
     source: NDArray[np.int8]
     change_points: tuple[ChangePoint, ...]
     learnt: dict[str, Array]
+    undecided_ns: tuple[int, ...]
+    missable_m: float
     faults: tuple[str, ...] = ()
 
 
@@ -79,10 +83,11 @@ def correct(
 
     Raises ValueError if fewer than :data:`.vectors.MIN_FRAMES` frames were measured.
     """
+    stamp_ns = np.asarray(stamp_ns, np.int64)
     run = prepare(stamp_ns, cam_T_grip, covariance, measured)
     outliers = outlier_frames(run)
     run.usable &= ~outliers
-    found = find(run)
+    found, undecided = find(run)
     progress()
     fit = _Fit(run, found, np.zeros_like(run.y))
     progress()
@@ -90,21 +95,27 @@ def correct(
     fit = _Fit(run, kept, fit.swing)
     progress()
     x, spread, source = fit.instants()
+    if undecided:
+        # Neither is preferred: the pose changed in all of them, or in none.
+        other = _Fit(run, sorted([*kept, *undecided], key=lambda change: change.index), fit.swing)
+        spread += 0.5 * (other.x - fit.x)[:, :, None] * (other.x - fit.x)[:, None, :]
     source[outliers] = DISBELIEVED
-    points = [_point(fit, k, np.asarray(stamp_ns, np.int64)) for k in range(len(kept))]
+    points = [_point(fit, k, stamp_ns) for k in range(len(kept))]
     vectors = x @ run.root.T
     error = np.einsum("ij,njk,lk->nil", run.root, spread, run.root, optimize=True)
     error = covariances_to_poses(error, vectors)
     learnt = {"frame": fit.blocks.frame, "white": fit.blocks.white}
     learnt |= {"slow": fit.smoothed.slow, "turn_per_s3": fit.smoothed.turn}
     return Correction(
-        np.asarray(stamp_ns, np.int64),
+        stamp_ns,
         to_poses(run.origin_T, vectors),
         0.5 * (error + np.swapaxes(error, -1, -2)),
         fit.segment,
         source,
         tuple(points),
         learnt,
+        tuple(stamp_ns[[change.index for change in undecided]].tolist()),
+        float(np.linalg.norm(run.root[:3], 2) * np.sqrt(largest_background_change(run))),
         run.faults,
     )
 

@@ -13,47 +13,48 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from gripmon.analyse.content import count
 from gripmon.analyse.dataset import Results, writing
-from gripmon.analyse.page import rendered
+from gripmon.analyse.page import Table, rendered
 from gripmon.analyse.stretches import POSE_COLUMNS
+from gripmon.analyse.words import count, millimetres
 from gripmon.io.sources.episodes import Episode
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import Verdict
 
-_MOST_SHOWN, _MOST_ROWS, _MOST_POINTS = 24, 200, 4000
-"""Episodes with pictures, rows of a table, points of a plot; the Parquet table has all of them."""
+_MOST_SHOWN, _MOST_POINTS = 24, 4000
+"""Episodes with pictures, points of a plot; the Parquet table has all of them."""
+_MOUNTING = ("Mounting", "Camera", "Stretches", "First", "Last", "TCP (mm)", "Farthest from it")
+_OF_MOUNTINGS = "Stretches of one mounting aren't told apart by their uncertainties."
 
 
 def write_page(path: Path, rows: pa.Table, results: Results, episodes: Sequence[Episode], name: str) -> None:
     """Write the report on the dataset ``name``: one HTML file that needs no network.  ``rows``: the table's, in the
     order of its ``episodes``, of which each has one or more.
     """
-    from plotly.offline import get_plotlyjs
-
-    from gripmon.analyse.plots import as_json, mountings_figure
+    from gripmon.analyse.plots import mountings_figure
 
     cameras, numbers = _filled(rows, "camera", ""), _filled(rows, "mounting", -1)
     groups: dict[tuple[str, int], list[int]] = {}
     for place in np.flatnonzero(numbers >= 0).tolist():
         groups.setdefault((cameras[place], int(numbers[place])), []).append(place)
+    named = sorted({camera for camera, _ in groups})
     figures = {
-        camera: as_json(mountings_figure(*_points(rows, np.flatnonzero((numbers >= 0) & (cameras == camera)), numbers)))
-        for camera in sorted({camera for camera, _ in groups})
+        f"camera-{n}": mountings_figure(*_points(rows, np.flatnonzero((numbers >= 0) & (cameras == camera)), numbers))
+        for n, camera in enumerate(named, 1)
     }
     failures = rows.filter(pc.is_null(rows["start_ns"])).select(["reason", "episode"]).to_pylist()
     reasons = Counter(str(row["reason"]).partition(";")[0] for row in failures)
     firsts = {str(row["reason"]).partition(";")[0]: row["episode"] for row in reversed(failures)}
+    failed = [(number, reason, firsts[reason]) for reason, number in reasons.most_common()]
     page = rendered(
         "dataset.html.j2",
-        name=name,
+        figures,
+        title=f"{name}: extrinsics",
         summary=_summary(rows, len(groups)),
-        mountings=[_mounting(rows, *key, groups[key]) for key in sorted(groups)],
+        cameras=named,
+        mountings=Table(_MOUNTING, [_mounting(rows, *key, groups[key]) for key in sorted(groups)], _OF_MOUNTINGS),
         worst=[_shown(results, episodes[number]) for number in _worst_first(rows)[:_MOST_SHOWN]],
-        failed=[(reason, number, firsts[reason]) for reason, number in reasons.most_common(_MOST_ROWS)],
-        most_rows=_MOST_ROWS,
-        figures=figures,
-        plotly=get_plotlyjs() if figures else "",
+        failed=Table(("Episodes", "Why", "The first of them"), failed),
     )
     with writing(path):
         write_atomically(path, page)
@@ -98,14 +99,13 @@ def _shown(results: Results, episode: Episode) -> dict[str, Any]:
     return {"episode": rows[0]["episode"], "camera": rows[0]["camera"], "rows": rows, "pictures": pictures}
 
 
-def _mounting(rows: pa.Table, camera: str, number: int, places: Sequence[int]) -> dict[str, Any]:
+def _mounting(rows: pa.Table, camera: str, number: int, places: Sequence[int]) -> tuple[Any, ...]:
+    """Its row of the table."""
     at_m, episodes = _tcp_m(rows, places), rows["episode"]
     middle_m = np.median(at_m, axis=0)
-    return {
-        "camera": camera, "number": number, "stretches": len(places), "first": episodes[places[0]].as_py(),
-        "last": episodes[places[-1]].as_py(), "tcp_mm": " ".join(f"{1e3 * value:.2f}" for value in middle_m),
-        "spread_m": float(np.linalg.norm(at_m - middle_m, axis=1).max()),
-    }  # fmt: skip
+    tcp_mm, far_m = " ".join(f"{1e3 * v:.2f}" for v in middle_m), float(np.linalg.norm(at_m - middle_m, axis=1).max())
+    first, last = episodes[places[0]].as_py(), episodes[places[-1]].as_py()
+    return number, camera, len(places), first, last, tcp_mm, millimetres(far_m)
 
 
 def _tcp_m(rows: pa.Table, places: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:

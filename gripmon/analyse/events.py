@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
-from gripmon.analyse.content import Event, Moment, Onset, count, duration
-from gripmon.analyse.track import SECOND_NS, Clock
+from gripmon.analyse.content import Event, Moment, Onset
+from gripmon.analyse.track import SECOND_NS, Track
+from gripmon.analyse.words import count, span
 from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, ReferenceRecord, Severity
 
 TITLES = {
@@ -27,99 +29,6 @@ TITLES = {
     AlertKind.STREAM: "The stream of frames was at fault",
     AlertKind.SOURCE: "The camera gave no frames",
 }
-_PAUSE_S = 1.0
-
-
-def alert_events(histories: Sequence[AlertHistory]) -> list[Event]:
-    """One event per alert that is not about a motion of the camera."""
-    return [_event(history) for history in histories if not history.is_motion]
-
-
-def _event(history: AlertHistory) -> Event:
-    alerts = history.alerts or history.all
-    # It is named after its most severe stage: occluded, then lost, is lost.
-    gravest = worst(alerts)
-    kind = [each.alert.kind for each in alerts if each.alert.severity == gravest][-1]
-    since_ns = history.since_ns
-    noted = not history.first.alert.alert_id
-    return Event(
-        kind=kind,
-        title=TITLES.get(kind, str(kind).replace("_", " ").capitalize()),
-        onset=Onset(since_ns, since_ns, since_ns, "alert"),
-        end_ns=history.first.stamp_ns if noted else None if history.over is None else history.over.stamp_ns,
-        **annotation(alerts, history.over),
-    )
-
-
-def annotation(alerts: Sequence[TimedAlert], over: TimedAlert | None) -> dict[str, Any]:
-    """What alerts say of an event: severity, cause, story; ``over``: the one that cleared it."""
-    alert = _explained(alerts)
-    named = [c.probability for c in alert.causes if (c.cause, c.part) == (alert.cause, alert.part)]
-    stages = alerts if over is None or over in alerts else (*alerts, over)
-    return {
-        "severity": worst(alerts),
-        "noticed_ns": alerts[0].stamp_ns,
-        "end_text": "" if over is None else over.alert.text,
-        "cause": alert.cause,
-        "cause_probability": named[0] if named else None,
-        "part": alert.part,
-        "causes": alert.causes,
-        "alert_id": alert.alert_id,
-        "story": tuple(
-            Moment(at_ns, f"{each.event}: {each.text}" if alerts[0].alert.alert_id else each.text)
-            for at_ns, each in stages
-        ),
-    }
-
-
-def pauses_of(clock: Clock) -> list[Event]:
-    """One event per pause of a second or more without frames."""
-    out = []
-    for i in np.flatnonzero(np.diff(clock.stamp_ns) > _PAUSE_S * SECOND_NS).tolist():
-        start_ns, end_ns = int(clock.stamp_ns[i]), int(clock.stamp_ns[i + 1])
-        missing = int(clock.seq[i + 1] - clock.seq[i]) - 1
-        length = duration(1e-9 * (end_ns - start_ns))
-        why = f"{count(missing, 'frame')} in between are not recorded" if missing else "the camera gave none meanwhile"
-        out.append(
-            Event(
-                kind="gap",
-                title=f"No frames for {length}",
-                severity=Severity.WARNING,
-                onset=Onset(start_ns, start_ns, start_ns, "frames"),
-                end_ns=end_ns,
-                story=(Moment(start_ns, f"no frames for {length}; {why}"),),
-            )
-        )
-    return out
-
-
-def reference_changes(
-    events: Sequence[Event], references: Sequence[ReferenceRecord], in_force_ns: dict[tuple[str, int], int]
-) -> list[Event]:
-    """One event per change of the reference that no alert reports; ``in_force_ns`` in order of time."""
-    alerted = (AlertKind.RECALIBRATED, AlertKind.RESTORED)
-    known_ns = [event.onset.stamp_ns for event in events if event.kind in alerted]
-    records = {(record.reference_id, record.revision): record for record in references}
-    recorded = [(records[key], start_ns) for key, start_ns in in_force_ns.items() if key in records]
-    return [
-        Event(
-            kind="reference",
-            title="A new reference",
-            severity=Severity.INFO,
-            onset=Onset(start_ns, start_ns, start_ns, "frames"),
-            end_ns=start_ns,
-            cause=record.cause,
-            story=(
-                Moment(
-                    start_ns,
-                    f"reference {record.reference_id}, revision {record.revision} ({record.origin}), accepted by "
-                    f"{record.accepted_by}",
-                ),
-            ),
-        )
-        for record, start_ns in recorded[1:]
-        if all(abs(start_ns - stamp_ns) >= SECOND_NS for stamp_ns in known_ns)
-    ]
 
 
 MOTIONS = (AlertKind.STEP, AlertKind.CREEP, AlertKind.DRIFT)
@@ -141,48 +50,106 @@ class AlertHistory:
 
     @property
     def first(self) -> TimedAlert:
-        return self.all[0]
-
-    @property
-    def since_ns(self) -> int:
-        """When it was raised; by its own record if the beginning isn't recorded."""
-        alert, stamp_ns = self.first.alert, self.first.stamp_ns
-        return stamp_ns if alert.since_ns is None else min(alert.since_ns, stamp_ns)
+        return (self.alerts or (self.over,))[0]  # type: ignore[return-value]  # one of them is there
 
     @property
     def is_motion(self) -> bool:
         """Whether it is about a motion of the camera."""
         return self.first.alert.kind in MOTIONS
 
-    @property
-    def all(self) -> tuple[TimedAlert, ...]:
-        return self.alerts if self.over is None else (*self.alerts, self.over)
 
-
-def histories_of(alerts: Sequence[AlertRecord], clock: Clock) -> list[AlertHistory]:
+def histories_of(alerts: Sequence[AlertRecord], track: Track) -> list[AlertHistory]:
     """In the order in which they began; an alert that is only noted has its own history."""
     histories: list[AlertHistory] = []
     open_ones: dict[str, int] = {}
     for alert in alerts:
-        timed = TimedAlert(clock.of(alert.seq, alert.stamp_ns), alert)
-        at = open_ones.get(alert.alert_id) if alert.alert_id else None
-        before = () if at is None else histories[at].alerts
+        timed = TimedAlert(track.time_of(alert.seq, alert.stamp_ns), alert)
+        at = open_ones.get(alert.alert_id, len(histories))
+        before = histories[at].alerts if at < len(histories) else ()
         cleared = alert.event is AlertEvent.CLEARED
-        history = AlertHistory(before, timed) if cleared else AlertHistory((*before, timed))
-        if at is not None:
-            histories[at] = history
-        else:
-            histories.append(history)
-            if alert.alert_id and not cleared:
-                open_ones[alert.alert_id] = len(histories) - 1
+        histories[at : at + 1] = [AlertHistory(before, timed) if cleared else AlertHistory((*before, timed))]
         if cleared:
             open_ones.pop(alert.alert_id, None)
+        elif alert.alert_id:
+            open_ones[alert.alert_id] = at
     return histories
 
 
-def worst(alerts: Sequence[TimedAlert]) -> Severity:
+def alert_event(history: AlertHistory) -> Event:
+    """The event of an alert that is not about a motion of the camera: named after its most severe stage, so that what
+    was occluded, then lost, is lost.
+    """
+    alerts = history.alerts or (history.first,)
+    kind = [each.alert.kind for each in alerts if each.alert.severity == _worst(alerts)][-1]
+    alert, stamp_ns = history.first.alert, history.first.stamp_ns
+    since_ns = stamp_ns if alert.since_ns is None else min(alert.since_ns, stamp_ns)  # its beginning isn't recorded
+    over_ns = None if history.over is None else history.over.stamp_ns
+    return Event(
+        kind=kind,
+        title=TITLES.get(kind, str(kind).replace("_", " ").capitalize()),
+        onset=Onset(since_ns, since_ns, since_ns, "alert"),
+        end_ns=over_ns if alert.alert_id else stamp_ns,
+        **annotation(alerts, history.over),
+    )
+
+
+def annotation(alerts: Sequence[TimedAlert], over: TimedAlert | None) -> dict[str, Any]:
+    """What alerts say of an event: severity, cause, story; ``over``: the one that cleared it."""
+    alert = _explained(alerts)
+    named = [c.probability for c in alert.causes if (c.cause, c.part) == (alert.cause, alert.part)]
+    stages = alerts if over is None or over in alerts else (*alerts, over)
+    return {
+        "severity": _worst(alerts),
+        "noticed_ns": alerts[0].stamp_ns,
+        "end_text": "" if over is None else over.alert.text,
+        "cause": alert.cause,
+        "cause_probability": named[0] if named else None,
+        "part": alert.part,
+        "causes": alert.causes,
+        "alert_id": alert.alert_id,
+        "story": tuple(
+            Moment(at_ns, f"{each.event}: {each.text}" if alerts[0].alert.alert_id else each.text)
+            for at_ns, each in stages
+        ),
+    }
+
+
+def pauses_of(track: Track) -> list[Event]:
+    """One event per pause of a second or more without frames."""
+    out = []
+    for i in np.flatnonzero(np.diff(track.stamp_ns) > SECOND_NS).tolist():
+        start_ns, end_ns = track.stamp_ns[i : i + 2].tolist()
+        missing, length = int(track.seq[i + 1] - track.seq[i]) - 1, span(start_ns, end_ns)
+        why = f"{count(missing, 'frame')} in between are not recorded" if missing else "the camera gave none meanwhile"
+        text = f"no frames for {length}; {why}"
+        out.append(_found("gap", f"No frames for {length}", Severity.WARNING, start_ns, end_ns, text))
+    return out
+
+
+def reference_changes(events: Sequence[Event], references: Sequence[ReferenceRecord], track: Track) -> list[Event]:
+    """One event per change of the reference that no alert reports."""
+    known_ns = [e.onset.stamp_ns for e in events if e.kind in (AlertKind.RECALIBRATED, AlertKind.RESTORED)]
+    records = {(record.reference_id, record.revision): record for record in references}
+    recorded = [(records[key], start_ns) for key, start_ns in track.in_force_ns().items() if key in records]
+    out = []
+    for record, start_ns in recorded[1:]:
+        if all(abs(start_ns - stamp_ns) >= SECOND_NS for stamp_ns in known_ns):
+            which = f"reference {record.reference_id}, revision {record.revision} ({record.origin})"
+            text = f"{which}, accepted by {record.accepted_by}"
+            found = _found("reference", "A new reference", Severity.INFO, start_ns, start_ns, text)
+            out.append(msgspec.structs.replace(found, cause=record.cause))
+    return out
+
+
+def _found(kind: str, title: str, severity: Severity, start_ns: int, end_ns: int, text: str) -> Event:
+    """What the frames show, without an alert."""
+    onset, story = Onset(start_ns, start_ns, start_ns, "frames"), (Moment(start_ns, text),)
+    return Event(kind=kind, title=title, severity=severity, onset=onset, end_ns=end_ns, story=story)
+
+
+def _worst(alerts: Sequence[TimedAlert]) -> Severity:
     """The highest severity among them."""
-    return max((each.alert.severity for each in alerts), key=list(Severity).index, default=Severity.INFO)
+    return max((each.alert.severity for each in alerts), key=list(Severity).index)
 
 
 def _explained(alerts: Sequence[TimedAlert]) -> AlertRecord:

@@ -252,12 +252,16 @@ def _unreported(points: Sequence[ChangePoint], events: Sequence[Event], limits: 
     return out
 
 
-def change_points_of(source: Recording, track: Track, alerted_ns: Sequence[int], limits: Limits) -> list[ChangePoint]:
+def change_points_of(
+    source: Recording, track: Track, alerted_ns: Sequence[int], limits: Limits
+) -> tuple[list[ChangePoint], float | None]:
     """The change points of a recording, in order of time: of all of it or, if it is long, around alerts
-    (``alerted_ns``) and around every significant change of the level.  None where too little was measured.
+    (``alerted_ns``) and around every significant change of the level.  None where too little was measured.  And up to
+    which size (m) steps may be missing among them; None: not known.
     """
     table = source.frames
     points: list[ChangePoint] = []
+    missable_m: list[float] = []
     matrices = table.matrices()
     for part in _parts(track, alerted_ns, limits):
         try:
@@ -265,7 +269,8 @@ def change_points_of(source: Recording, track: Track, alerted_ns: Sequence[int],
         except ValueError:  # too few frames were measured, or have a valid covariance
             continue
         points += found.change_points
-    return points
+        missable_m.append(found.missable_m)
+    return points, max(missable_m, default=None)
 
 
 def _parts(track: Track, alerted_ns: Sequence[int], limits: Limits) -> list[slice]:

@@ -22,7 +22,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import Alert, Array, Protection, ValidBy, Verdict
 from gripmon.model.units import in_mm
-from gripmon.record.table import FrameTable, pose_matrices
+from gripmon.record.table import COLUMNS, FrameTable, pose_matrices
 
 _NUMBER = re.compile(r"\d[\d.e+-]*")
 POSE_COLUMNS = tuple(f"cam_T_grip_{name}" for name in POSE_NAMES)
@@ -59,7 +59,7 @@ class Stretch(msgspec.Struct, frozen=True, kw_only=True):
     valid_by: Annotated[Text, _is("which error protection bounds: absolute; reference, of the motion since it")] = None
     protection_m: Annotated[Number, _is("bound on the position error in each valid frame of it; null: none")] = None
     protection_rad: Annotated[Number, _is("bound on the rotation error")] = None
-    integrity_risk: Annotated[Number, _is("probability per frame that the error exceeds a bound")] = None
+    integrity_risk: Annotated[Number, _is(COLUMNS["integrity_risk"].help)] = None
     since_reference_m: Annotated[Number, _is("bound on the position error of the motion since since_ns")] = None
     since_reference_rad: Annotated[Number, _is("bound on its rotation error")] = None
     since: Annotated[Text, _is("what that counts from, in this episode: reference, or first_proved frames")] = None

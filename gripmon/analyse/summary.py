@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.analyse.affected import excess
-from gripmon.analyse.content import (
-    AffectedRange,
-    Event,
-    RecordingReport,
+from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
+from gripmon.analyse.events import MOTIONS
+from gripmon.analyse.words import (
     clock_time,
     count,
     date,
     degrees,
     duration,
+    listed,
     millimetres,
+    often,
     percent,
     period,
-    size,
     span,
 )
-from gripmon.analyse.events import MOTIONS
 from gripmon.model.coverage import too_few
-from gripmon.model.records import AlertKind, Cause
+from gripmon.model.records import AlertKind, Cause, CauseWeight
 
 CAUSES: dict[str, str] = {
     Cause.CAMERA_MOUNT: "the camera's mount moved",
@@ -46,64 +45,66 @@ _ACCEPTERS = ("monitor", "operator")
 
 def cause_words(event: Event) -> str:
     """``the camera's mount moved (99.8 %)``."""
-    text = CAUSES.get(event.cause, event.cause.replace("_", " "))
-    if event.part:
-        text = f"the {event.part} finger was bent" if event.cause == Cause.FINGER_BENT else f"{text} ({event.part})"
+    if event.cause == Cause.FINGER_BENT and event.part:
+        text = f"the {event.part} finger was bent"
+    else:
+        text = _cause(event.cause, event.part)
     if event.cause == Cause.UNKNOWN or event.cause_probability is None:
         return text
     return f"{text} ({percent(event.cause_probability)})"
 
 
+def weighed(cause: CauseWeight) -> str:
+    """``a finger was bent (left): 3 %``."""
+    return f"{_cause(cause.cause, cause.part)}: {percent(cause.probability)}"
+
+
+def _cause(name: str, part: str | None) -> str:
+    text = CAUSES.get(name, str(name).replace("_", " "))
+    return f"{text} ({part})" if part else text
+
+
 def paragraph(report: RecordingReport) -> str:
     """When the camera moved, how far, why, whether it still is displaced, what is affected, what was lost."""
-    who = f"{report.robot} / {report.camera}"
     if not report.running.frames:
-        return f"{who}: no frame could be read, so nothing is known about its camera."
+        return f"{report.robot} / {report.camera}: no frame could be read, so nothing is known about its camera."
     motions = [event for event in report.events if event.kind in MOTIONS]
-    parts = [_too_few(report), _motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
+    parts = [missing(report), _motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
     return " ".join(part for part in parts if part)
 
 
-def _too_few(report: RecordingReport) -> str:
-    """What the reader must know before anything else: that frames are missing, or weren't measured."""
+def missing(report: RecordingReport) -> str:
+    """What the reader must know before anything else: that frames are missing, or weren't measured; empty if none."""
     running = report.running
     dropped = min(running.monitor_dropped or 0, running.frames_dropped)
-    text = too_few(
-        running.frames - running.frames_refused,
-        dropped=dropped,
-        missing=running.frames_dropped - dropped,
-        unmeasured=running.frames_refused,
-    )
-    return " ".join(f"{part[0].upper()}{part[1:]}." for part in (text, _missing(report)) if part)
-
-
-def _missing(report: RecordingReport) -> str:
-    """``100 frames (20 %) are missing (the monitor was too busy for 90)``; empty if none is."""
-    running = report.running
-    if not running.frames_dropped:
-        return ""
-    share = percent(running.frames_dropped / (running.frames + running.frames_dropped))
-    known = ((running.monitor_dropped, "the monitor"), (running.recording_dropped, "the recorder"))
-    reasons = [f"{who} was too busy for {number}" for number, who in known if number]
-    are = "is missing" if running.frames_dropped == 1 else "are missing"
-    why = f" ({_and(reasons)})" if reasons else ""
-    return f"{count(running.frames_dropped, 'frame')} ({share}) {are}{why}"
+    parts = [
+        too_few(
+            running.frames - running.frames_refused,
+            dropped=dropped,
+            missing=running.frames_dropped - dropped,
+            unmeasured=running.frames_refused,
+        )
+    ]
+    if running.frames_dropped:
+        share = percent(running.frames_dropped / (running.frames + running.frames_dropped))
+        known = ((running.monitor_dropped, "the monitor"), (running.recording_dropped, "the recorder"))
+        reasons = [f"{who} was too busy for {number}" for number, who in known if number]
+        why = f" ({listed(reasons)})" if reasons else ""
+        are = "is" if running.frames_dropped == 1 else "are"
+        parts.append(f"{count(running.frames_dropped, 'frame')} ({share}) {are} missing{why}")
+    return " ".join(f"{part[0].upper()}{part[1:]}." for part in parts if part)
 
 
 def headline(report: RecordingReport) -> str:
-    """The same in a sentence, for one recording among several."""
+    """The motions in a sentence, for one recording among several."""
     motions = [event for event in report.events if event.kind in MOTIONS]
     largest = max(motions, key=lambda e: e.moved.size_m if e.moved else 0.0)
     when = f"{date(largest.onset.stamp_ns)} {clock_time(largest.onset.stamp_ns)}"
     most = "" if len(motions) == 1 else ", farthest"
-    text = f"{report.robot} / {report.camera} moved {_times(len(motions))}{most} at {when}"
+    text = f"{report.robot} / {report.camera} moved {often(len(motions))}{most} at {when}"
     text += f" by {size(largest.moved)}" if largest.moved else ""
     end = "" if report.at_end is None else f"; at the end its TCP is {millimetres(report.at_end.size_m)} off"
     return f"{text}: {cause_words(largest)}{end}."
-
-
-def _times(number: int) -> str:
-    return {1: "once", 2: "twice"}.get(number, f"{number} times")
 
 
 def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
@@ -119,7 +120,7 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
     shown.sort(key=lambda e: e.onset.stamp_ns)
     largest = " The largest:" if len(shown) < len(motions) else ""
     sentences = " ".join(_motion(event, i == 0) for i, event in enumerate(shown))
-    return f"T{who} moved {_times(len(motions))} ({when}).{largest} {sentences}"
+    return f"T{who} moved {often(len(motions))} ({when}).{largest} {sentences}"
 
 
 def _motion(event: Event, first: bool) -> str:
@@ -160,14 +161,14 @@ def _affected(report: RecordingReport) -> str:
     old = [a for a in report.affected if a.what == "old_calibration"]
     if not old:
         return ""
-    text = f"Work that relied on the initial calibration is affected {_listed(old)}"
+    text = f"Work that relied on the initial calibration is affected {_times(old)}"
     stale = [a for a in report.affected if a.what == "stale_reference"]
     if stale:
-        text += f"; work that relied on the reference then in force, {_listed(stale)}"
+        text += f"; work that relied on the reference then in force, {_times(stale)}"
     return text + "."
 
 
-def _listed(ranges: Sequence[AffectedRange]) -> str:
+def _times(ranges: Sequence[AffectedRange]) -> str:
     worst = sorted(ranges, key=lambda a: a.start_ns - a.end_ns)[:_MAX_SHOWN]
     worst.sort(key=lambda a: a.start_ns)
     texts = []
@@ -176,27 +177,22 @@ def _listed(ranges: Sequence[AffectedRange]) -> str:
         texts.append(f"from {clock_time(each.start_ns)} to {end} ({span(each.start_ns, each.end_ns)})")
     more = f" and in {count(len(ranges) - len(worst), 'shorter time')}" if len(ranges) > len(worst) else ""
     off = max((a.largest.size_m for a in ranges if a.largest), default=0.0)
-    return f"{_and(texts)}{more}, off by up to {millimetres(off)}"
+    return f"{listed(texts)}{more}, off by up to {millimetres(off)}"
+
+
+def lasting_s(report: RecordingReport, what: str) -> float:
+    """How long, in all."""
+    return sum(1e-9 * (a.end_ns - a.start_ns) for a in report.affected if a.what == what)
 
 
 def _lost(report: RecordingReport) -> str:
     running = report.running
-    total_s = {
-        what: sum(1e-9 * (a.end_ns - a.start_ns) for a in report.affected if a.what == what)
-        for what in ("unknown", "suspect")
-    }
-    parts = []
-    if total_s["unknown"]:
-        parts.append(f"for {duration(total_s['unknown'])} there was no transform")
-    if total_s["suspect"]:
-        parts.append(f"for {duration(total_s['suspect'])} it was only suspect")
+    unknown_s, suspect_s = lasting_s(report, "unknown"), lasting_s(report, "suspect")
+    parts = [f"for {duration(unknown_s)} there was no transform"] if unknown_s else []
+    parts += [f"for {duration(suspect_s)} it was only suspect"] if suspect_s else []
     if running.gaps:
         parts.append(f"{count(running.gaps, 'pause')} without frames, the longest {duration(running.longest_gap_s)}")
-    if not parts:
-        whole = [share.name for share in running.verdicts] == ["valid"] and not running.frames_dropped
-        return "Nothing was lost: every frame has a valid transform." if whole else ""
-    return f"Lost: {_and(parts)}."
-
-
-def _and(parts: Sequence[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+    if parts:
+        return f"Lost: {listed(parts)}."
+    whole = [share.name for share in running.verdicts] == ["valid"] and not running.frames_dropped
+    return "Nothing was lost: every frame has a valid transform." if whole else ""

@@ -121,7 +121,7 @@ def _name_both(stream: rr.RecordingStream) -> None:
             send.lines(path, [f"{whose} {name}" for name in names], pale, width)
 
 
-def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:
+def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: Any) -> None:
     """Write a run's frame table and its correction into a file; ``about`` is kept as JSON.
 
     It has the recording id of the original, so that a viewer shows both files as one, on the same timelines.  Shifts of
