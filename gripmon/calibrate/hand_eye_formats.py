@@ -12,7 +12,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
@@ -171,7 +170,7 @@ def _joints(document: Document) -> Iterator[_Pair]:
         at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
         values = FileValues(document.file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
         shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
-        pose = make_transform(Rotation.from_euler("xyz", turn).as_matrix(), np.array(shift))
+        pose = make_transform(_from_angles(*turn), np.array(shift))
         yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
 
 
@@ -220,10 +219,20 @@ def _command(file: str, kind: str, words: list[str]) -> _Pair:
     parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
     shift = [values.number(key, 0.0) for key in "xyz"]
     if any(key in content for key in ("roll", "pitch", "yaw")):
-        turn = Rotation.from_euler("xyz", [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]).as_matrix()
-        return _Pair(kind, parent, child, make_transform(turn, np.array(shift)))
+        angles = [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]
+        return _Pair(kind, parent, child, make_transform(_from_angles(*angles), np.array(shift)))
     quaternion = [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"]
     return _Pair(kind, parent, child, _pose(values, shift, quaternion))
+
+
+def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
+    """Rotation (3, 3) by angles (rad) about fixed x, y, z, as in URDF."""
+    out = np.eye(3)
+    for axis, angle in enumerate((roll, pitch, yaw)):
+        half = [0.0, 0.0, 0.0]
+        half[axis] = np.sin(0.5 * angle)
+        out = rotation_from_xyzw((*half, np.cos(0.5 * angle))) @ out
+    return out
 
 
 def _pose(values: FileValues, shift: Sequence[float], quaternion: Sequence[float]) -> Array:
