@@ -96,3 +96,22 @@ def test_20_a_reference_in_camera_link(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["check", str(tmp_path / "config.yaml")]) == 2
     said = capsys.readouterr().err
     assert "puts the TCP along the camera's x: the axes of a ROS body such as camera_link (x forward" in said
+
+
+def test_16_asymmetric_circles(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, out = str(case(16)), tmp_path / "camera.yaml"
+    assert main(["calibrate", "intrinsics", folder, "--target", "circles:4x11:0.02:0.007", "--out", str(out)]) == 3
+    assert "the discs are staggered (asymmetric circles); --target acircles:4x11:0.02:0.007" in capsys.readouterr().err
+    assert main(["calibrate", "intrinsics", folder, "--target", "acircles:4x11:0.02:0.007", "--out", str(out)]) == 0
+    camera = camera_in(out).lens
+    found = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    assert found == pytest.approx((900.0, 900.0, 639.5, 359.5), abs=1.0)
+
+
+def test_17_a_board_of_another_dictionary(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, out = str(case(17)), tmp_path / "camera.yaml"
+    wrong, right = (f"charuco:8x6:0.035:0.024:{name}" for name in ("DICT_5X5_50", "DICT_4X4_50"))
+    assert main(["calibrate", "intrinsics", folder, "--target", wrong, "--out", str(out)]) == 2
+    assert f"markers of DICT_4X4_50 are in the images, not of DICT_5X5_50; {right}" in capsys.readouterr().err
+    assert main(["calibrate", "intrinsics", folder, "--target", right, "--out", str(out)]) == 0
+    assert camera_in(out).lens.fx_px == pytest.approx(900.0, abs=0.5)
