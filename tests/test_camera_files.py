@@ -299,6 +299,10 @@ def test_four_numbers_are_no_tangential_terms_when_they_are_too_large():
         assert isinstance(read_camera(data, "x", model="brown_conrady").camera, BrownConradyLens)
         fisheye = read_camera(data, "x", model="fisheye").camera
         assert isinstance(fisheye, FisheyeLens) and fisheye.coefficients == (-0.03, 0.005, *p)
+    # A fisheye from a bug report, and a real lens of 2283 px: on either side of the limit.
+    with pytest.raises(InterchangeError, match="--model fisheye"):
+        read_camera(opencv_file([-0.0349, 0.0054, -0.0157, 0.0066]), "x")
+    assert read_camera(opencv_file([0.044, 0.0, -0.002, -0.009, 0.0]), "x").camera.coefficients[3] == -0.009
     doubtful = read_camera(opencv_file([-0.03, 0.005, near, -near]), "x")
     assert isinstance(doubtful.camera, BrownConradyLens) and "cv2.fisheye also writes four" in doubtful.warnings[0]
     assert not read_camera(opencv_file([-0.03, 0.005, near, -near, 0.0]), "x").warnings
