@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 from support.sightings import CAMERAS, PLATE_M, poses, seen
 
+from gripmon.calibrate import api, bundle
 from gripmon.calibrate.bundle import MODELS, lens_vector, plate_pose
 from gripmon.calibrate.intrinsics import calibrate, calibrate_best, calibrate_single_view, cross_validate, doubts_of
 from gripmon.calibrate.sighting import CalibrationError, Sighting
@@ -120,6 +121,59 @@ def test_a_view_by_another_camera_is_named():
     other = replace(seen(CAMERAS["fisheye"], poses(rng, 1, 0.12), rng)[0], name="stranger.png")
     with pytest.raises(CalibrationError, match=r"stranger\.png: \d+ of \d+ points contradict the other images"):
         calibrate([*views[:4], other, *views[4:]], "brown_conrady")
+
+
+def test_views_that_contradict_the_others_are_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(13)
+    views = [replace(view, name=f"{k}.png") for k, view in enumerate(seen(BROWN, poses(rng, 9), rng))]
+    strange = seen(CAMERAS["fisheye"], poses(rng, 2, 0.12), rng)
+    others = [replace(view, name=f"stranger{k}.png") for k, view in enumerate(strange)]
+    monkeypatch.setattr(api, "_views", lambda *_: ([*views[:4], *others, *views[4:]], {"none.png": "no board"}))
+    found = api.calibrate_intrinsics([], "chequerboard:9x7:0.02", model="brown_conrady")
+    assert [sighting.name for sighting in found.sightings] == [f"{k}.png" for k in range(9)]
+    assert set(found.not_found) == {"none.png", "stranger0.png", "stranger1.png"}
+    assert "points contradict the other images" in found.not_found["stranger1.png"]
+    assert "stranger0.png is left out: " in " ".join(found.fit.warnings)
+    assert len(found.fit.residuals_px) == 9
+    np.testing.assert_allclose(found.camera.fx_px, 700.0, atol=5.0 * found.sigmas["fx_px"])
+
+
+def test_where_half_of_the_views_contradict_nobody_knows_which_half(monkeypatch: pytest.MonkeyPatch):
+    views, tried = seen(BROWN, poses(np.random.default_rng(1), 6), np.random.default_rng(2)), []
+
+    def contradicted(left: list[Sighting], *_: object) -> None:
+        tried.append(len(left))
+        raise bundle.ContradictionError(left[0], 40)
+
+    monkeypatch.setattr(api, "_views", lambda *_: (views, {}))
+    monkeypatch.setattr(api, "_fitted", contradicted)
+    with pytest.raises(CalibrationError, match=r"40 of \d+ points contradict the other images; images of"):
+        api.calibrate_intrinsics([], "chequerboard:9x7:0.02")
+    assert tried == [6, 5, 4]  # of six, three left out are half
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_5"])
+def test_views_that_determine_nothing_end_after_a_bounded_effort(model: str, monkeypatch: pytest.MonkeyPatch):
+    """A set like this one was given up after 254 s."""
+    rng = np.random.default_rng(3)
+    held = [flat_pose(*rng.uniform(-0.02, 0.02, 2), rng.uniform(1.0, 1.2)) for _ in range(5)]
+    views, count = seen(BROWN, held, rng, noise_px=0.3), 0
+    plain = bundle.BundleProblem._cost
+
+    def cost(*arguments: object) -> float:
+        nonlocal count
+        count += 1
+        return plain(*arguments)
+
+    monkeypatch.setattr(bundle, "MOST_EVALUATIONS", 150)
+    monkeypatch.setattr(bundle.BundleProblem, "_cost", cost)
+    with pytest.raises(CalibrationError, match=r"don't determine the camera|did not converge in 150 evaluations"):
+        calibrate(views, model)
+    assert 150 < count < 200  # and those that check a start
+    monkeypatch.undo()
+    assert bundle.MOST_EVALUATIONS >= 10 * 100  # what good views take: see the next lines
+    monkeypatch.setattr(bundle, "MOST_EVALUATIONS", 100)
+    assert calibrate(seen(BROWN, poses(rng, 9), rng), "brown_conrady").rms_px < 0.15
 
 
 def test_views_by_two_cameras_are_refused():

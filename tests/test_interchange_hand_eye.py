@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 from urdf_parser_py.urdf import URDF
 
-from gripmon.calibrate.interchange import HandEye, roll_pitch_yaw, write_hand_eye
+from gripmon.calibrate.hand_eye_files import HandEye, roll_pitch_yaw, write_hand_eye
 from gripmon.model.geometry import to_record
 
 COVARIANCE = tuple((np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) ** 2).ravel().tolist())

@@ -14,7 +14,7 @@ from PIL import Image as PilImage
 from support.episode_files import NS, STORE, Shots, write_mcap, write_rosbag2, write_video
 from test_episode_sources import BEGIN_NS, FINGERS, LENS, frames_of, shots
 
-from gripmon.calibrate.formats import read_ros
+from gripmon.calibrate.camera_files import read_camera
 from gripmon.io.sources import BagSettings, FolderSettings, SourceError, VideoSettings, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.io.sources.stamps import JUMP_NS, Stamped, rising
@@ -129,7 +129,7 @@ def test_a_camera_info_file_reads_likewise():
         b"[80, 0, 31, 0, 81, 24, 0, 0, 1]}, distortion_coefficients: "
         b"{rows: 1, cols: 8, data: [0.1, 0, 0, 0, 0, 0, 0, 0]}}"
     )
-    assert read_ros(text, "x").coefficients == (0.1, 0.0, 0.0, 0.0, 0.0)
+    assert read_camera(text, "x").camera.coefficients == (0.1, 0.0, 0.0, 0.0, 0.0)
 
 
 DAY = 86_400 * NS

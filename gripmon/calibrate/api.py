@@ -16,13 +16,15 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import cv2
+import msgspec
 import numpy as np
 
 from gripmon.calibrate import intrinsics, robot_world
-from gripmon.calibrate.bundle import MODELS, ModelName, parameter_names
+from gripmon.calibrate.bundle import MODELS, ContradictionError, ModelName, parameter_names
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.intrinsics import IntrinsicsResult
+from gripmon.calibrate.markers import other_dictionary
 from gripmon.calibrate.robot_world import RobotWorld
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.calibrate.verify import verify
@@ -33,11 +35,13 @@ from gripmon.model.images import images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
-from gripmon.model.targets import Charuco, Target, TargetError, name_of, parse_target
+from gripmon.model.targets import Charuco, Chequerboard, Target, TargetError, name_of, parse_target
 
 __all__ = ["CameraFromViews", "calibrate_intrinsics", "calibrate_robot_world", "verify"]
 
 _FOLDS = 5
+_TRIED = 3
+"""Images without a board that are searched for markers of other dictionaries."""
 Wanted = ModelName | Literal["auto"] | None
 
 
@@ -126,9 +130,11 @@ def calibrate_intrinsics(
     target = parse_target(target) if isinstance(target, str) else target
     check_fixed(fixed, model)
     sightings, not_found = _views(images, target, progress)
-    found = _fitted(sightings, model, fixed, progress)
-    found = replace(found, warnings=(*found.warnings, *_about_target(sightings, target)))
-    return CameraFromViews(found, target, tuple(sightings), MappingProxyType(not_found))
+    found, contradicting = _agreeing(sightings, model, fixed, progress)
+    sightings = [sighting for sighting in sightings if sighting.name not in contradicting]
+    left_out = [f"{name} is left out: {reason}" for name, reason in contradicting.items()]
+    found = replace(found, warnings=(*left_out, *found.warnings, *_about_target(sightings, target)))
+    return CameraFromViews(found, target, tuple(sightings), MappingProxyType({**not_found, **contradicting}))
 
 
 def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
@@ -170,6 +176,9 @@ def _views(
     if not sightings:
         (reason, times), *_ = Counter(not_found.values()).most_common(1)
         why = reason if times == len(images) else f"{times} of them: {reason}"
+        if isinstance(target, Charuco) and (other := other_dictionary(images_of_one_camera(images[:_TRIED]), target)):
+            why = f"markers of {other} are in the images, not of {target.dictionary}"
+            raise TargetError(f"{why}; {name_of(msgspec.structs.replace(target, dictionary=other))}")
         count = "the image doesn't show" if len(images) == 1 else f"none of {len(images)} images shows"
         # If all images have the same fault, the one line says enough.
         details = [f"{name}: {why}" for name, why in not_found.items()] if len(set(not_found.values())) > 1 else []
@@ -178,6 +187,21 @@ def _views(
         # If the rest is hidden or out of view, a smaller target fits as well: such images prove nothing.
         raise TargetError(f"{len(larger)} of {len(images)} images show a larger one ({larger[0]}); its full size")
     return sightings, not_found
+
+
+def _agreeing(
+    sightings: list[Sighting], wanted: Wanted, fixed: Mapping[str, float | None], progress: Progress
+) -> tuple[IntrinsicsResult, dict[str, str]]:
+    """The fit to the views that don't contradict it, more than half of them, and why the others do, by name."""
+    left, contradicting = sightings, dict[str, str]()
+    while True:
+        try:
+            return _fitted(left, wanted, fixed, progress), contradicting
+        except ContradictionError as error:
+            left = [sighting for sighting in left if sighting is not error.sighting]
+            contradicting[error.sighting.name] = error.said
+            if 2 * len(left) <= len(sightings):
+                raise
 
 
 def _fitted(
@@ -204,13 +228,16 @@ def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
     """A warning if the target may be smaller than it was described: without markers nothing else reveals that."""
     if isinstance(target, Charuco):
         return []
-    step_m = getattr(target, "square_m", None) or getattr(target, "spacing_m", 1.0)
+    if isinstance(target, Chequerboard):
+        step_m, whole = target.square_m, [target.columns, target.rows]
+    else:
+        step_m, whole = target.step_m, [max(each) + 1 for each in zip(*target.places, strict=True)]
     spans = [sorted(np.ptp(s.plate_m[:, :2], axis=0).tolist(), reverse=True) for s in sightings]
     seen = [round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)]
-    if seen[0] >= max(target.columns, target.rows) or len(sightings) == 1:
+    if seen[0] >= max(whole) or len(sightings) == 1:
         return []
-    whole = f"{target.columns} x {target.rows}"
-    return [f"no image shows more than {seen[0]} x {seen[1]} of the target's {whole} points: is its description right?"]
+    points = f"{seen[0]} x {seen[1]} of the target's {whole[0]} x {whole[1]} points"
+    return [f"no image shows more than {points}: is its description right?"]
 
 
 def calibrate_robot_world(

@@ -8,6 +8,7 @@ view, a perturbation of its pose; the Jacobian is analytic.  Outliers are found 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +35,10 @@ from gripmon.model.least_squares import (
 from gripmon.model.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
 from gripmon.model.records import Array
 
-LARGEST_ITERATIONS = 200
+MOST_EVALUATIONS = 1000
+"""Costs that one calibration may compute, over all its starts and rounds: some sixteen times what views tilted to
+different sides take with any model.
+"""
 OUTLIER = 5.0
 """Normalised residual, in robust standard deviations, above which a point is left out at the end."""
 LEAST_VIEW_INLIERS = 0.5
@@ -74,13 +78,33 @@ class Bundle:
         return float(np.sqrt(np.mean(np.square(used))))
 
 
+class ContradictionError(CalibrationError):
+    """A view of another camera, focus or target than the others."""
+
+    def __init__(self, sighting: Sighting, points: int) -> None:
+        self.sighting = sighting
+        self.said = f"{points} of {len(sighting)} points contradict the other images"
+        super().__init__(f"{sighting.name}: {self.said}; images of one camera and focus, or without this one")
+
+
+class Effort:
+    """What a calibration may still compute."""
+
+    def __init__(self) -> None:
+        self.left = MOST_EVALUATIONS
+
+
+class _SpentError(Exception):
+    """The effort is spent."""
+
+
 class BundleProblem:
     """Sightings and a lens model; ``free`` (k, p) maps p free parameters to changes of all k: a column with two ones
-    ties two parameters together.
+    ties two parameters together.  Problems of one calibration share their ``effort``.
     """
 
-    def __init__(self, model: LensModel, sightings: Sequence[Sighting], free: Array):
-        self._model, self._sightings, self._free = model, sightings, free
+    def __init__(self, model: LensModel, sightings: Sequence[Sighting], free: Array, effort: Effort | None = None):
+        self._model, self._sightings, self._free, self._effort = model, sightings, free, effort or Effort()
         self._whiten: list[Array] = [whitening(s.covariance_px) for s in sightings]
         self._offsets: list[Array] = [np.zeros(s.uv_px.shape) for s in sightings]
 
@@ -161,32 +185,32 @@ class BundleProblem:
         p = self._free.shape[1]
 
         def cost(at: _State) -> float:
+            if self._effort.left <= 0:
+                raise _SpentError
+            self._effort.left -= 1
             return self._cost(*at, weights) if (at[0][:2] > 0.0).all() else np.inf
 
         def moved(at: _State, step: Array) -> _State:
             steps = step[p:].reshape(-1, 6)
             return at[0] + self._free @ step[:p], [perturb(T, xi) for T, xi in zip(at[1], steps, strict=True)]
 
-        found = minimise(
-            (parameters, poses), cost, lambda at: self._equations(*at, weights), moved, iterations=LARGEST_ITERATIONS
-        )
-        if found.converged:
-            return found.state
-        normals = np.stack([T[:3, 2] for T in found.state[1]])
+        with contextlib.suppress(_SpentError):
+            return minimise(
+                (parameters, poses), cost, lambda at: self._equations(*at, weights), moved, iterations=MOST_EVALUATIONS
+            ).state
+        normals = np.stack([T[:3, 2] for T in poses])
         if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL_COSINE:
             raise CalibrationError(DEGENERATE)
         raise CalibrationError(
-            f"did not converge in {LARGEST_ITERATIONS} steps; more views, more tilted against each other, or a model "
-            "with fewer parameters"
+            f"did not converge in {MOST_EVALUATIONS} evaluations; more views, more tilted against each other, or a "
+            "model with fewer parameters"
         )
 
     def _check_views(self, used: Sequence[NDArray[np.bool_]]) -> None:
-        for sighting, good in zip(self._sightings, used, strict=True):
-            if len(used) > 1 and good.mean() < LEAST_VIEW_INLIERS:
-                raise CalibrationError(
-                    f"{sighting.name}: {int((~good).sum())} of {len(good)} points contradict the other images; images "
-                    "of one camera and focus, or without this one"
-                )
+        if len(used) > 1:
+            sighting, good = min(zip(self._sightings, used, strict=True), key=lambda one: float(one[1].mean()))
+            if good.mean() < LEAST_VIEW_INLIERS:
+                raise ContradictionError(sighting, int((~good).sum()))
 
     def _conclude(self, parameters: Array, poses: list[Array], used: list[NDArray[np.bool_]]) -> Bundle:
         weights = [u.astype(float) for u in used]

@@ -25,19 +25,28 @@ from gripmon.calibrate.lattice import (
     to_bytes,
     to_grey,
 )
+from gripmon.calibrate.markers import marked_corners
 from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.staggered import lattice_of, places_of
 from gripmon.model.records import Array, Image
-from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target, TargetError
+from gripmon.model.targets import (
+    FEWEST,
+    Charuco,
+    Chequerboard,
+    CircleGrid,
+    StaggeredCircles,
+    Target,
+    name_of,
+)
 
-_CHARUCO = cv2.aruco.CharucoParameters()
-_CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
-_Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
 CORNER_RADIUS = 0.42
 """Radius of the window around a corner, in squares."""
 TOO_BLURRED = 0.16
 """Standard deviation of the edges' blur above which an image isn't measured: in squares; for discs twice the number, in
 units of the smaller of gap and radius.
 """
+_MOST_OF = 0.7
+"""Part of a staggered target that no rectangle of a lattice is."""
 BLURRED_PX = 3.0
 """Standard deviation of the edges' blur above which it is reported."""
 
@@ -56,14 +65,14 @@ def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
 
 def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     shown = to_bytes(grey)
-    board, corners, ids, marks = _marked_corners(shown, target)
+    board, corners, ids, marks = marked_corners(shown, target)
     if 2 * len(ids) < (target.columns - 1) * (target.rows - 1):
         turned = msgspec.structs.replace(target, columns=target.rows, rows=target.columns)
-        if len(_marked_corners(shown, turned)[2]) > max(len(ids), FEWEST["charuco"] - 1):
+        if len(marked_corners(shown, turned)[2]) > max(len(ids), FEWEST["charuco"] - 1):
             sizes = f"{turned.columns} x {turned.rows} squares, not {turned.rows} x {turned.columns}"
             return NotFound(f"the board has {sizes}: columns and rows are swapped")
         # In a mirrored board some markers look like others of the dictionary.
-        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
+        if len(marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
             return NotFound("the board is mirrored; an image that isn't flipped")
         if len(ids) < FEWEST["charuco"]:
             board_is = f"a board of {target.columns} x {target.rows} squares"
@@ -77,47 +86,6 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
     return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
-
-
-def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
-    """The board, corners (n, 2), their numbers (n,) and the number of visible markers, for the pattern that shows more:
-    before version 4.6 of OpenCV boards with an even number of rows began with the other colour.
-    """
-    if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
-        raise TargetError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    found: list[_Marked] = []
-    for legacy in (False, True) if target.rows % 2 == 0 else (False,):
-        board = cv2.aruco.CharucoBoard((target.columns, target.rows), target.square_m, target.marker_m, dictionary)
-        board.setLegacyPattern(legacy)
-        corners, ids, _, marks = cv2.aruco.CharucoDetector(board, _CHARUCO).detectBoard(shown)
-        numbers = np.zeros(0, np.intp) if ids is None else np.asarray(ids, np.intp).ravel()
-        places = np.asarray(corners if len(numbers) else [], np.float64).reshape(-1, 2)
-        agreeing = _agreeing(np.asarray(board.getChessboardCorners())[numbers], places)
-        found.append((board, places[agreeing], numbers[agreeing], 0 if marks is None else len(marks)))
-        if 2 * len(found[-1][2]) > (target.columns - 1) * (target.rows - 1):
-            break
-    return max(found, key=lambda one: len(one[2]))
-
-
-def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
-    """(n,) which corners agree roughly with one plane: what looks like a marker need not be one."""
-    if len(places) < 5:
-        return np.ones(len(places), bool)
-    tolerance_px = 0.6 * float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
-    plane, mask = cv2.findHomography(
-        plate[:, :2].astype(np.float64), places, cv2.RANSAC, tolerance_px, maxIters=500, confidence=0.999
-    )
-    if plane is None or _mirrors(np.asarray(plane, np.float64), plate[mask.ravel() > 0]):
-        return np.zeros(len(places), bool)
-    out: NDArray[np.bool_] = mask.ravel() > 0
-    return out
-
-
-def _mirrors(plane: Array, plate: Array) -> bool:
-    """Whether a homography flips the plate at these points (n, 3); elsewhere its sign means nothing."""
-    depth = plate[:, :2] @ plane[2, :2] + plane[2, 2]
-    return bool(np.linalg.det(plane) * np.median(depth) < 0.0)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
@@ -141,20 +109,20 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
-    columns, rows = target.columns, target.rows
-    found = find_discs(grey, columns, rows, target.spacing_m / target.diameter_m)
+    (columns, rows), step_m = lattice_of(target)
+    found = find_discs(grey, columns, rows, step_m / target.diameter_m, len(target.places))
     if not found:
-        return NotFound(_blurred(grey) or "no lattice of discs in the image; one that is evenly lit and not too small")
+        none = "no lattice of discs in the image; one that is evenly lit and not too small"
+        return NotFound(_staggered(grey, target) or _blurred(grey) or none)
     cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
-    seen = cells.max(axis=0) + 1
-    fewer = len(cells) < columns * rows and ends_all_round(grey, cells, rough, squares=False)
-    if fewer or max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
-        return _wrong_count(cells, columns, rows, "discs")
+    places = _places(grey, cells, rough, target)
+    if isinstance(places, NotFound):
+        return places
     where = {(int(c), int(r)): k for k, (c, r) in enumerate(cells.tolist())}
     pairs = [(k, where[c + 1, r]) for (c, r), k in where.items() if (c + 1, r) in where]
     starts = rough[[a for a, _ in pairs]]
     blur_px = edge_blur_px(grey, starts, 0.5 * (starts + rough[[b for _, b in pairs]]))
-    share = target.diameter_m / target.spacing_m
+    share = target.diameter_m / step_m
     steps = _steps(cells, rough)
     if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(steps)):
         return NotFound(_too_coarse(blur_px, steps))
@@ -164,10 +132,38 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     good = np.array([centre is not None for centre in centres])
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
     covariance = np.array([np.eye(2) if centre is None else centre[1] for centre in centres])
-    cells = _turned(cells, columns, rows)
-    plate = np.concatenate([cells * target.spacing_m, np.zeros((len(cells), 1))], axis=1)
-    radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), columns * rows, blur_px)
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, radius_m, name, note, FEWEST["circles"])
+    plate = np.concatenate([places * target.step_m, np.zeros((len(cells), 1))], axis=1)
+    radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), len(target.places), blur_px)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, FEWEST["circles"])
+
+
+def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGrid) -> NDArray[np.intp] | NotFound:
+    """Steps (n, 2) along the target's axes of the discs at cells of its lattice, or why it isn't this target."""
+    columns, rows = target.columns, target.rows
+    if isinstance(target, StaggeredCircles):
+        places = places_of(cells, target)
+        what = f"{len(cells)} discs on a lattice, but not as staggered as {name_of(target)}"
+        return NotFound(what) if places is None else places
+    seen, incomplete = cells.max(axis=0) + 1, len(cells) < columns * rows
+    if incomplete and (reason := _staggered(grey, target)):
+        return NotFound(reason)
+    fewer = incomplete and ends_all_round(grey, cells, rough, squares=False)
+    if fewer or max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
+        return _wrong_count(cells, columns, rows, "discs")
+    return _turned(cells, columns, rows)
+
+
+def _staggered(grey: Grey, target: CircleGrid) -> str:
+    """The reason if the discs are staggered, but the target's aren't; otherwise empty."""
+    if isinstance(target, StaggeredCircles):
+        return ""
+    staggered = StaggeredCircles(target.columns, target.rows, target.spacing_m, target.diameter_m)
+    (columns, rows), step_m = lattice_of(staggered)
+    found = find_discs(grey, columns, rows, step_m / target.diameter_m, len(staggered.places))
+    if not found or len(found[0]) <= _MOST_OF * len(staggered.places):
+        return ""
+    places = places_of(np.array(list(found[0]), np.intp), staggered)
+    return "" if places is None else f"the discs are staggered (asymmetric circles); --target {name_of(staggered)}"
 
 
 def _sighting(

@@ -1,41 +1,18 @@
-"""Cameras from and for other programs, and hand/eye transforms for them, by format name; a lens that a format doesn't
-support becomes the nearest one.
-
-A robot's tree runs from arm to camera, whereas ``cam_T_grip`` gives the gripper in the camera frame.  So the camera's
-pose in the gripper's frame is written (origin at the TCP, x across the jaws, z out of the gripper), or with
-``gripper_in_camera`` the gripper's pose in the camera frame.
-"""
+"""Cameras for other programs, by format name; a lens that a format doesn't support becomes the nearest one."""
 
 from __future__ import annotations
 
-import json
-import math
-import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import msgspec
+import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from gripmon.calibrate.formats import (
-    InterchangeError,
-    number_text,
-    read_kalibr,
-    read_mrcal,
-    read_ros,
-    write_kalibr,
-    write_mrcal,
-    write_ros,
-)
-from gripmon.calibrate.opencv_files import SYNTAXES, read_opencv, write_opencv
+from gripmon.calibrate.foreign import InterchangeError, number_text
 from gripmon.model.camera import BrownConradyLens, Camera, LensSettings, make_camera
-from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.lenses import BrownMap
-from gripmon.model.records import Array, Transform
+from gripmon.model.records import Array
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0
@@ -43,6 +20,10 @@ LARGEST_FIT_PX = 1.0
 _BROWN_COUNTS = {"ros": (4, 5, 8, 12), "kalibr": (4,), "opencv": (4, 5, 8, 12), "mrcal": (4, 5, 8, 12)}
 _FITTED_COUNTS = {"ros": (5, 8), "kalibr": (4,), "opencv": (5, 8), "mrcal": (5, 8)}
 _FISHEYE = ("ros", "kalibr", "opencv")
+SYNTAXES = {
+    ".yaml": cv2.FileStorage_FORMAT_YAML, ".yml": cv2.FileStorage_FORMAT_YAML,
+    ".xml": cv2.FileStorage_FORMAT_XML, ".json": cv2.FileStorage_FORMAT_JSON,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,45 +32,6 @@ class Exported:
 
     data: bytes
     warnings: tuple[str, ...] = ()
-
-
-def format_of(data: bytes, file: str) -> str:
-    """The format of a file, by its content; only the file name's suffix identifies OpenCV's JSON."""
-    head = data[:65536].lstrip(b"\xef\xbb\xbf \t\r\n")
-    text = head.decode(errors="replace")
-    if b"LENSMODEL_" in data:
-        return "mrcal"
-    if text.startswith(("%YAML:", "<?xml", "<opencv_storage")) or "opencv-matrix" in text:
-        return "opencv"
-    if "distortion_coeffs" in text and "camera_model" in text:
-        return "kalibr"
-    if "image_width" in text and "camera_matrix" in text:
-        return "opencv" if Path(file).suffix == ".json" else "ros"
-    raise InterchangeError(file, "", "is in no format that is recognised", f"--format {' or '.join(FORMATS)}")
-
-
-def read_camera(
-    data: bytes,
-    file: str,
-    kind: str,
-    which: str | None = None,
-    size_px: tuple[int, int] | None = None,
-    fisheye: bool | None = None,
-) -> LensSettings:
-    """The camera in a file's bytes.  Options for what a file may leave open: ``which`` of several cameras, the image's
-    size, and whether the lens is a fisheye.  :class:`InterchangeError` for a missing camera, for one that no monitor
-    can use, and for options that this format doesn't need.
-    """
-    given = {"--camera": which, "--size": size_px, "--fisheye": fisheye}
-    useful = {"kalibr": {"--camera"}, "opencv": {"--size", "--fisheye"}}.get(kind, set())
-    for option, value in given.items():
-        if value is not None and option not in useful:
-            raise InterchangeError(file, "", f"{option} has no meaning for a {kind} file", "leave it out")
-    if kind == "kalibr":
-        return read_kalibr(data, file, which)
-    if kind == "opencv":
-        return read_opencv(data, file, size_px, fisheye)
-    return read_mrcal(data, file) if kind == "mrcal" else read_ros(data, file)
 
 
 def write_camera(
@@ -109,9 +51,9 @@ def write_camera(
         warnings.append("rational_polynomial with 12 coefficients: OpenCV takes them, ROS's own text speaks of 8")
     notes = [" ".join(note.split()) for note in (*notes, *warnings)]
     if kind == "opencv":
-        data = write_opencv(camera, notes, name, suffix.lower() if suffix.lower() in SYNTAXES else ".yaml")
+        data = _write_opencv(camera, notes, name, suffix.lower() if suffix.lower() in SYNTAXES else ".yaml")
     else:
-        data = {"ros": write_ros, "kalibr": write_kalibr, "mrcal": write_mrcal}[kind](camera, notes, name)
+        data = {"ros": _write_ros, "kalibr": _write_kalibr, "mrcal": _write_mrcal}[kind](camera, notes, name)
     return Exported(data, tuple(warnings))
 
 
@@ -143,6 +85,101 @@ def _nearest(camera: LensSettings, kind: str, file: str, fit: bool) -> tuple[Len
             f"another format, or --fit for the nearest Brown-Conrady ({count} coefficients), {off}",
         )  # fmt: skip
     return fitted.camera, f"the lens was {camera.__struct_config__.tag}; this is the nearest Brown-Conrady, {off}"
+
+
+def _list_text(values: Sequence[float]) -> str:
+    return "[" + ", ".join(map(number_text, values)) + "]"
+
+
+def _write_ros(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
+    """Write rectification and projection for a monocular camera."""
+    coefficients = list(camera.coefficients)  # type: ignore[union-attr]
+    if camera.__struct_config__.tag == "fisheye":
+        model = "equidistant"
+    elif len(coefficients) <= 5:
+        model = "plumb_bob"
+        coefficients += [0.0] * (5 - len(coefficients))
+    else:
+        model = "rational_polynomial"
+    fx, fy, cx, cy = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+
+    def matrix(key: str, rows: int, columns: int, data: list[float]) -> list[str]:
+        return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: {_list_text(data)}"]
+
+    lines = [
+        *(f"# {note}" for note in notes),
+        f"image_width: {camera.width_px}",
+        f"image_height: {camera.height_px}",
+        f"camera_name: {name}",
+        *matrix("camera_matrix", 3, 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1]),
+        f"distortion_model: {model}",
+        *matrix("distortion_coefficients", 1, len(coefficients), coefficients),
+        *matrix("rectification_matrix", 3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1]),
+        *matrix("projection_matrix", 3, 4, [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _write_kalibr(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
+    """One camera, ``cam0``."""
+    model = "equidistant" if camera.__struct_config__.tag == "fisheye" else "radtan"
+    coefficients = camera.coefficients[:4]  # type: ignore[union-attr]  # a fifth is zero
+    lines = [
+        *(f"# {note}" for note in notes),
+        "cam0:",
+        "  cam_overlaps: []",
+        "  camera_model: pinhole",
+        f"  distortion_coeffs: {_list_text(coefficients)}",
+        f"  distortion_model: {model}",
+        f"  intrinsics: {_list_text((camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))}",
+        f"  resolution: [{camera.width_px}, {camera.height_px}]",
+        f"  rostopic: /{name}/image_raw",
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _write_mrcal(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
+    """Keys are in the order that mrcal's own reader expects; ``extrinsics`` are zeros."""
+    coefficients = camera.coefficients  # type: ignore[union-attr]
+    pinhole = not any(coefficients) and len(coefficients) == 4
+    intrinsics = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *(() if pinhole else coefficients)]
+    model = "LENSMODEL_PINHOLE" if pinhole else f"LENSMODEL_OPENCV{len(coefficients)}"
+    lines = [
+        *(f"# {note}" for note in (*notes, f"camera {name}")),
+        "{",
+        f"    'lensmodel':  '{model}',",
+        "",
+        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....",
+        f"    'intrinsics': [ {', '.join(repr(float(v)) for v in intrinsics)},],",
+        "",
+        "    # extrinsics are rt_fromref",
+        "    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],",
+        "",
+        f"    'imagersize': [ {camera.width_px}, {camera.height_px},]",
+        "}",
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _write_opencv(camera: LensSettings, notes: Sequence[str], name: str, suffix: str = ".yaml") -> bytes:
+    """Write in the syntax that belongs to ``suffix``."""
+    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | SYNTAXES[suffix])
+    if suffix == ".json":
+        # JSON has no comments, but OpenCV writes some, which other readers reject.  They also reject \'.
+        storage.write("notes", " | ".join(notes).replace("'", ""))
+    else:
+        for note in notes:
+            storage.writeComment(note.replace("--", "- -") if suffix == ".xml" else note)
+    storage.write("camera_name", name)
+    storage.write("image_width", camera.width_px)
+    storage.write("image_height", camera.height_px)
+    storage.write("fisheye_model", int(camera.__struct_config__.tag == "fisheye"))
+    storage.write(
+        "camera_matrix",
+        np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]]),
+    )
+    storage.write("distortion_coefficients", np.array([camera.coefficients]).T)  # type: ignore[union-attr]
+    return storage.releaseAndGetString().encode()
 
 
 GOOD_ENOUGH_PX = 0.001
@@ -239,146 +276,3 @@ def _linear(xy: Array, q: Array, count: int) -> Array:
 
 def _ordered(values: Array) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
-
-
-HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
-_FRAME = re.compile(r"[^/\s\"'<>&][^\s\"'<>&]*")
-
-
-@dataclass(frozen=True, slots=True)
-class HandEye:
-    """The data to export: ``cam_T_grip`` with its 6 x 6 covariance (as published), and the frames' names.
-
-    ``name`` is the calibration's; the marker's frame and the robot's base appear in an easy_handeye2 file only for
-    completeness.
-    """
-
-    cam_T_grip: Transform
-    covariance: tuple[float, ...]
-    gripper_frame: str = "gripper_tcp"
-    camera_frame: str = "camera_optical_frame"
-    gripper_in_camera: bool = False
-    name: str = "gripmon"
-    robot_base_frame: str = "base_link"
-    tracking_marker_frame: str = "calibration_plate"
-
-    def __post_init__(self) -> None:
-        for key in ("gripper_frame", "camera_frame", "robot_base_frame", "tracking_marker_frame", "name"):
-            value = getattr(self, key)
-            if not _FRAME.fullmatch(value):
-                raise ValueError(
-                    f"{key}: {value!r} isn't a frame's name; without blanks, quotes, angle brackets, and no / in front"
-                )
-        if self.gripper_frame == self.camera_frame:
-            raise ValueError(f"both frames are called {self.camera_frame}; two names")
-
-    @property
-    def frames(self) -> tuple[str, str]:
-        """Parent and child."""
-        pair = self.gripper_frame, self.camera_frame
-        return pair[::-1] if self.gripper_in_camera else pair
-
-    @property
-    def parent_T_child(self) -> Array:
-        """(4, 4), from the child's coordinates to the parent's."""
-        cam_T_grip = from_record(self.cam_T_grip)
-        return cam_T_grip if self.gripper_in_camera else invert(cam_T_grip)
-
-
-def write_hand_eye(hand_eye: HandEye, kind: str, notes: Sequence[str]) -> str:
-    """The text in one of :data:`HAND_EYE_FORMATS`, with ``notes`` as comments.  ValueError if it can't be expressed."""
-    notes = [" ".join(note.split()) for note in notes]
-    writer = {"ros-static": _ros_static, "urdf": _urdf, "easy_handeye2": _easy_handeye2, "json": _json}[kind]
-    return writer(hand_eye, notes)
-
-
-def _ros_static(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A shell script with one command, which publishes the transform while it runs."""
-    (x, y, z), quaternion = _parts(hand_eye)
-    parent, child = hand_eye.frames
-    words = ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    values = dict(zip(("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw"), (x, y, z, *quaternion), strict=True))
-    for option, value in values.items():
-        words += [option, repr(value)]
-    words += ["--frame-id", parent, "--child-frame-id", child]
-    return "".join(f"# {note}\n" for note in notes) + shlex.join(words) + "\n"
-
-
-def _urdf(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A fixed joint between two links of the robot's description."""
-    parent, child = hand_eye.frames
-    xyz = " ".join(map(repr, hand_eye.parent_T_child[:3, 3].tolist()))
-    rpy = " ".join(map(repr, roll_pitch_yaw(hand_eye.parent_T_child[:3, :3])))
-    comments = "".join(f"<!-- {_xml_comment(note)} -->\n" for note in notes)
-    return (
-        f'{comments}<joint name="{parent}_to_{child}" type="fixed">\n'
-        f'  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
-        f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n</joint>\n'
-    )
-
-
-def _easy_handeye2(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """A ``.calib`` file of the eye-in-hand type: the camera's pose in the effector's frame, here at the TCP."""
-    if hand_eye.gripper_in_camera:
-        raise ValueError("an easy_handeye2 file has the camera in the effector's frame; without --gripper-in-camera")
-    translation, rotation = _parts(hand_eye)
-    lines = [
-        *(f"# {note}" for note in notes),
-        "parameters:",
-        f"  name: {json.dumps(hand_eye.name)}",
-        "  calibration_type: eye_in_hand",
-        f"  robot_base_frame: {json.dumps(hand_eye.robot_base_frame)}",
-        f"  robot_effector_frame: {json.dumps(hand_eye.gripper_frame)}",
-        f"  tracking_base_frame: {json.dumps(hand_eye.camera_frame)}",
-        f"  tracking_marker_frame: {json.dumps(hand_eye.tracking_marker_frame)}",
-        "  freehand_robot_movement: true",
-        "  move_group_namespace: /",
-        "  move_group: manipulator",
-        "transform:",
-        "  translation:",
-        *(f"    {axis}: {number_text(v)}" for axis, v in zip("xyz", translation, strict=True)),
-        "  rotation:",
-        *(f"    {axis}: {number_text(v)}" for axis, v in zip("xyzw", rotation, strict=True)),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _json(hand_eye: HandEye, notes: Sequence[str]) -> str:
-    """Both directions, with covariance: of the TCP's position error, then the rotation error, camera axes (m, rad)."""
-    parent, child = hand_eye.frames
-    content: dict[str, Any] = {
-        "parent_frame": parent,
-        "child_frame": child,
-        "parent_T_child": {
-            **msgspec.to_builtins(to_record(hand_eye.parent_T_child)),
-            "matrix": hand_eye.parent_T_child.tolist(),
-        },
-        "cam_T_grip": msgspec.to_builtins(hand_eye.cam_T_grip),
-        "covariance": list(hand_eye.covariance),
-        "notes": list(notes),
-    }
-    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-
-
-def _parts(hand_eye: HandEye) -> tuple[list[float], list[float]]:
-    record = to_record(hand_eye.parent_T_child)
-    return list(record.translation_m), list(record.rotation_xyzw)
-
-
-def _xml_comment(text: str) -> str:
-    """Avoid double hyphens, which would end the comment."""
-    return text.replace("--", "- -").replace("--", "- -")
-
-
-def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
-    """Rotation matrix (3, 3) -> angles (rad) about fixed x, y, z, as in URDF: ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
-
-    If the pitch is ±90 degrees, only roll minus (or plus) yaw is defined; the angles still give the same matrix,
-    because yaw is computed after roll and pitch.
-    """
-    r = np.asarray(rotation, dtype=np.float64)
-    pitch = math.atan2(-r[2, 0], math.hypot(r[2, 1], r[2, 2]))
-    roll = math.atan2(r[2, 1], r[2, 2]) if math.hypot(r[2, 1], r[2, 2]) > 1e-9 else 0.0
-    sine, cosine = math.sin(roll), math.cos(roll)
-    yaw = math.atan2(sine * r[0, 2] - cosine * r[0, 1], cosine * r[1, 1] - sine * r[1, 2])
-    return roll, pitch, yaw

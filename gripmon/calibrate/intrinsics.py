@@ -20,6 +20,8 @@ from gripmon.calibrate.bundle import (
     DEGENERATE,
     Bundle,
     BundleProblem,
+    ContradictionError,
+    Effort,
     LensModel,
     ModelName,
     lens_vector,
@@ -94,19 +96,19 @@ def calibrate_best(
     """
     best: IntrinsicsResult | None = None
     criterion: dict[str, float] = {}
-    reasons = []
+    reasons: list[CalibrationError] = []
     for model in models:
         try:
             result = calibrate(sightings, model, fixed=fixed)
         except CalibrationError as error:
-            reasons.append(f"{model}: {error}")
+            reasons.append(error)
         else:
             criterion[model] = (result.criterion or {})[model]
             if best is None or criterion[model] < criterion[best.model]:
                 best = result
         step()
     if best is None:
-        raise CalibrationError(reasons[0].partition(": ")[2])
+        raise next((error for error in reasons if isinstance(error, ContradictionError)), reasons[0])
     return replace(best, criterion=criterion)
 
 
@@ -205,10 +207,11 @@ def _supported(
     what was held.
     """
     held: list[str] = []
+    effort = Effort()
     lens = [name for name in parameter_names(lens_model.name)[5:] if name not in fixed]
     for name in (*reversed(lens), ""):
         names, free = _free(lens_model.name, frozenset((*fixed, *held)))
-        problem = BundleProblem(lens_model, sightings, free)
+        problem = BundleProblem(lens_model, sightings, free, effort)
         if near is None:
             bundle = _solve(problem, lens_model, sightings, fixed)
         else:

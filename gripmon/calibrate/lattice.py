@@ -285,22 +285,26 @@ class _Metric:
         return abs(float(a @ b)) < 0.45 * float(np.hypot(*a) * np.hypot(*b))
 
 
-def find_discs(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) -> list[dict[Index, Disc]]:
+def find_discs(
+    grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int
+) -> list[dict[Index, Disc]]:
     """Lattices of discs (column, row) -> disc: the largest that fits into ``columns`` x ``rows``, in either
-    orientation, or otherwise the largest that was found; empty if there is none.
+    orientation, or otherwise the largest that was found; empty if there is none.  ``count``: when it is complete.
     """
     if max(grey.shape) > LARGE_PX:
         half: Grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-        found = _search(half, columns, rows, spacing_per_diameter)
+        found = _search(half, columns, rows, spacing_per_diameter, count)
         if found and fits(found[0], columns, rows):
             return [
                 {cell: Disc(2.0 * d.centre_px + 0.5, 4.0 * d.spread_px2, d.dark) for cell, d in one.items()}
                 for one in found
             ]
-    return _search(grey, columns, rows, spacing_per_diameter)
+    return _search(grey, columns, rows, spacing_per_diameter, count)
 
 
-def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) -> list[dict[Index, Disc]]:
+def _search(
+    grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int
+) -> list[dict[Index, Disc]]:
     best: dict[Index, Disc] = {}
     others: list[dict[Index, Disc]] = []
     shown = to_bytes(grey)
@@ -323,7 +327,7 @@ def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) ->
                     others.append(found)
                 left = np.delete(np.arange(len(centres)), chosen)
                 centres, spreads = centres[left], spreads[left]
-            if len(best) == columns * rows:
+            if len(best) == count:
                 return [best]
     return [best or max(others, key=len)] if best or others else []
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
-from gripmon.calibrate.formats import as_number, read_mapping
+from gripmon.calibrate.foreign import as_number, read_mapping
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.errors import InputError, input_errors

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from gripmon import __version__
+from gripmon.calibrate.markers import dictionary_of
 from gripmon.model.errors import InputError
 from gripmon.model.targets import Charuco, CircleGrid, Target, TargetError, name_of
 
@@ -87,8 +88,9 @@ def print_target(target: Target, paper: str = "a4") -> PrintedTarget:
 def size_mm(target: Target) -> tuple[float, float]:
     """Width and height of the printed pattern (mm)."""
     if isinstance(target, CircleGrid):
-        step, disc = 1e3 * target.spacing_m, 1e3 * target.diameter_m
-        return (target.columns - 1) * step + disc, (target.rows - 1) * step + disc
+        step, disc = 1e3 * target.step_m, 1e3 * target.diameter_m
+        right, below = (max(each) for each in zip(*target.places, strict=True))
+        return right * step + disc, below * step + disc
     more = 0 if isinstance(target, Charuco) else 1
     return (target.columns + more) * 1e3 * target.square_m, (target.rows + more) * 1e3 * target.square_m
 
@@ -99,9 +101,9 @@ _Shape = tuple[str, Sequence[float]]
 
 def _shapes(target: Target) -> Iterator[_Shape]:
     if isinstance(target, CircleGrid):
-        step, radius = 1e3 * target.spacing_m, 5e2 * target.diameter_m
-        for row, column in np.ndindex(target.rows, target.columns):
-            yield "disc", (radius + step * column, radius + step * row, radius)
+        step, radius = 1e3 * target.step_m, 5e2 * target.diameter_m
+        for x, y in target.places:
+            yield "disc", (radius + step * x, radius + step * y, radius)
         return
     if isinstance(target, Charuco):
         yield from _marked_squares(target)
@@ -114,9 +116,7 @@ def _shapes(target: Target) -> Iterator[_Shape]:
 
 def _marked_squares(target: Charuco) -> Iterator[_Shape]:
     """Boxes of OpenCV's board: the markers' dark cells, and the squares without a marker."""
-    if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
-        raise TargetError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    dictionary = dictionary_of(target.dictionary)
     cells = dictionary.markerSize + 2
     if target.columns * target.rows // 2 > len(dictionary.bytesList):
         count = len(dictionary.bytesList)

@@ -15,11 +15,11 @@ _FRAMES = ("gripper_frame", "camera_frame", "robot_base_frame", "tracking_marker
 
 _IMPORT_OPTIONS = """
 FILE                file of the other program
---format            its format (default: recognised by its content)
---camera CAM        which camera of a camchain, e.g. cam1 (default: the only one)
+--camera NAME       which of several cameras, e.g. cam1, or M1 of OpenCV's stereo; of a hand/eye transform the frame
+                    that is the camera's (default: the only one)
 --size WIDTHxHEIGHT
-                    image size (px), for an OpenCV file without it
---fisheye           the four coefficients of an OpenCV file are cv2.fisheye's; for a file without fisheye_model
+                    image size (px), for a file without it
+--model             the lens, where the file doesn't say it or calls a fisheye plumb_bob
 --out FILE.yaml     file to write
 --force             replace the file if there is one
 """
@@ -27,7 +27,8 @@ FILE                file of the other program
 _IMPORT_EXAMPLES = """\
   gripmon calibrate import camera_info.yaml --out camera.yaml
   gripmon calibrate import camchain.yaml --camera cam1 --out camera.yaml
-  gripmon calibrate import intrinsics.xml --size 1280x960 --out camera.yaml
+  gripmon calibrate import intrinsics.xml --size 1280x960 --model fisheye --out camera.yaml
+  gripmon calibrate import wrist.calib --out reference.yaml
 
 exit codes: 0 written; 2 wrong usage or files: nothing is written then"""
 
@@ -72,22 +73,24 @@ def _name(text: str) -> str:
 
 
 @Command(
-    "import", "a camera from a file of ROS, Kalibr, OpenCV or mrcal", _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
-    format={"choices": CAMERA_FORMATS}, size=_size, fisheye={"default": None}, out=REQUIRED,
+    "import", "a camera or a hand/eye transform from another program's file", _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
+    size=_size, model={"choices": ("brown_conrady", "fisheye")}, out=REQUIRED,
 )  # fmt: skip
 def import_(arguments: Arguments) -> None:
-    """Import a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
-    FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content.
+    """Import a camera that another program has calibrated: of ROS (camera_info, also as ros2 topic echo prints it,
+    ost.txt), Kalibr, OpenCV (YAML, XML, JSON), mrcal, COLMAP (cameras.txt), RealSense, ORB-SLAM, VINS or
+    OpenICC (GoPro); or a hand/eye transform of easy_handeye 1 or 2, MoveIt, a static_transform_publisher or a
+    URDF joint.  The format is recognised by the content.  Commands that take a camera also take these files as
+    they are; import answers what they leave open.
     """
-    from gripmon.daemon.exchange import import_camera
+    from gripmon.daemon.exchange import import_calibration
 
     arguments.check_outputs("out")
-    given = arguments.camera, arguments.size, arguments.fisheye
-    kind, found = import_camera(arguments.file, arguments.format, *given, arguments.command_line())
+    found, lines = import_calibration(
+        arguments.file, arguments.command_line(), which=arguments.camera, size_px=arguments.size, model=arguments.model
+    )
     arguments.save("out", found)
-    camera, lens = found.camera, found.camera.__struct_config__.tag
-    print(f"{kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px")
-    print(f"written: {arguments.out}")
+    print("\n".join([*lines, f"written: {arguments.out}"]))
 
 
 @Command(

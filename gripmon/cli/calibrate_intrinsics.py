@@ -18,7 +18,8 @@ _OPTIONS = """
 IMAGE...               image file, or folder with images
 --target TARGET        chequerboard:COLUMNSxROWS:SQUARE (inner corners, m),
                        charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m),
-                       circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), or FILE.yaml of a calibration with it
+                       circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), acircles:… (staggered; SPACING in a row),
+                       or FILE.yaml of a calibration with it
 --model                lens model; auto: the one with the smallest information criterion
                        (default: brown_conrady; for a single image paper)
 --fix NAME[=VALUE]...  hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square

@@ -15,13 +15,15 @@ import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration
+from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
-from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.calibrated import foreign_camera, read_camera
 from gripmon.daemon.config.checks import covariance_of
+from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import kind_of, read_document, read_settings, read_yaml
-from gripmon.daemon.robot_file import is_robot_reference, robot_reference
+from gripmon.daemon.robot_file import is_robot_reference, reference_values, robot_reference
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
@@ -40,7 +42,9 @@ from gripmon.teach.mounts import Mount, towards
 from gripmon.teach.outlines import RoughCorners, check_rough, outlines_of
 from gripmon.track.edges.taught import gripper_digest
 
-_RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its estimates (JSON lines)"
+_RIGHT = "a file of gripmon calibrate or another program, a configuration, a monitor's state or its estimates"
+_MOST_FOREIGN_BYTES = 1 << 24
+"""Largest file that may be another program's."""
 
 
 def read_calibrated(path: Path) -> Calibrated:
@@ -50,8 +54,14 @@ def read_calibrated(path: Path) -> Calibrated:
     if head.startswith(b'{"sha256"'):
         return _state(path, data)
     if head.startswith(b"{") and path.suffix != ".yaml":
-        return _estimates(path, data)
-    return _of_yaml(path, read_yaml(path))
+        return _foreign(path, data) or _estimates(path, data)
+    try:
+        values = read_yaml(path)
+    except ConfigError:
+        if (found := _foreign(path, data)) is None:
+            raise
+        return found
+    return _of_yaml(path, values, data)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -66,7 +76,18 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"{path}: can't be read ({error.strerror}); {_RIGHT}") from None
 
 
-def _of_yaml(path: Path, values: dict[str, object]) -> Calibrated:
+def _foreign(path: Path, data: bytes) -> Calibrated | None:
+    """What another program's file holds; None if it is of none that is known."""
+    if len(data) > _MOST_FOREIGN_BYTES:
+        return None
+    hand_eye = read_hand_eye(data, str(path))
+    if hand_eye is not None:
+        return _robot(path, reference_values(hand_eye))
+    found = foreign_camera(path)
+    return None if found is None else Calibrated(str(path), "another program's camera", found.camera)
+
+
+def _of_yaml(path: Path, values: dict[str, object], data: bytes) -> Calibrated:
     readers = {"gripmon.camera_calibration/1": _camera, "gripmon.hand_eye_calibration/1": _hand_eye}
     if values.get("schema") in readers:
         return readers[str(values["schema"])](path)
@@ -74,9 +95,11 @@ def _of_yaml(path: Path, values: dict[str, object]) -> Calibrated:
         return _configuration(path)
     if is_robot_reference(values):
         return _robot(path, values)
-    if "model" in values:
+    if "fx_px" in values:
         return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
     kind = kind_of(values)
+    if kind is None and (found := _foreign(path, data)) is not None:
+        return found
     raise InputError(f"{path}: holds no calibration{f', it is {kind}' if kind else ''}; {_RIGHT}")
 
 

@@ -1,39 +1,59 @@
-"""Calibrations of other programs, and for them: ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2."""
+"""Calibrations of other programs, and for them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 
+from gripmon.calibrate.camera_files import LensModel
+from gripmon.calibrate.camera_files import read_camera as read_foreign_camera
 from gripmon.calibrate.documents import CameraCalibration
-from gripmon.calibrate.interchange import FORMATS, Exported, HandEye, format_of, write_camera, write_hand_eye
-from gripmon.calibrate.interchange import read_camera as read_foreign_camera
+from gripmon.calibrate.hand_eye_files import HandEye, write_hand_eye
+from gripmon.calibrate.hand_eye_formats import read_hand_eye
+from gripmon.calibrate.interchange import FORMATS, Exported, write_camera
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.calibrations import read_bytes, read_calibrated
+from gripmon.daemon.robot_file import reference_values
 from gripmon.model.errors import InputError
+from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
+from gripmon.model.yaml_text import as_yaml
 
 
-def import_camera(
+def import_calibration(
     path: Path,
-    kind: str | None,
-    which: str | None,
-    size_px: tuple[int, int] | None,
-    fisheye: bool | None,
     command: str,
-) -> tuple[str, CameraCalibration]:
-    """The format of another program's file (``kind`` None: recognised by its content), and its camera.  ``command`` is
-    for the provenance.  :class:`~gripmon.model.errors.InputError`.
+    *,
+    which: str | None = None,
+    size_px: tuple[int, int] | None = None,
+    model: LensModel | None = None,
+) -> tuple[CameraCalibration | bytes, list[str]]:
+    """What another program's file holds, for a file of gripmon's, and lines that say what it is: a camera, or the text
+    of a hand/eye transform.  Options as in :func:`~gripmon.calibrate.camera_files.read_camera`, ``which`` also of a
+    hand/eye transform's frames; ``command`` is for the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
-    data = read_bytes(path)
-    kind = kind or format_of(data, str(path))
-    return kind, CameraCalibration(
-        camera=read_foreign_camera(data, str(path), kind, which, size_px, fisheye),
-        parameters=(),
-        covariance=(),
-        warnings=(f"imported from {kind}: its uncertainty is unknown",),
-        provenance=provenance_of(command, [path]),
+    data, made = read_bytes(path), provenance_of(command, [path])
+    hand_eye = read_hand_eye(data, str(path), which=which)
+    if hand_eye is not None:
+        if size_px is not None or model is not None:
+            raise InputError(f"{path}: is a hand/eye transform ({hand_eye.kind}); without --size and --model")
+        origin = f"{hand_eye.kind}: {hand_eye.gripper_frame} to {hand_eye.camera_frame}"
+        notes = [f"{origin}, from {path.name}, SHA-256 {made.inputs[0].sha256}", f"written {made.time}: {made.command}"]
+        x, y, z = (1e3 * invert(hand_eye.grip_T_cam)[:3, 3]).tolist()
+        lines = [origin, f"{hand_eye.gripper_frame} is at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"]
+        if hand_eye.covariance is None:
+            tcp = f"if the TCP isn't at {hand_eye.gripper_frame} (x across the jaws, z out): flange_T_tcp in this file"
+            notes, lines = [*notes, tcp], [*lines, tcp]
+        text = "".join(f"# {note}\n" for note in notes) + as_yaml(reference_values(hand_eye), inline=True)
+        return text.encode(), lines
+    found = read_foreign_camera(data, str(path), which=which, size_px=size_px, model=model)
+    camera, lens = found.camera, found.camera.__struct_config__.tag
+    lines = [f"{found.kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px"]
+    unknown = f"imported from {found.kind}: its uncertainty is unknown"
+    calibration = CameraCalibration(
+        camera=camera, parameters=(), covariance=(), warnings=(unknown, *found.warnings), provenance=made
     )
+    return calibration, [*lines, *(f"warning: {warning}" for warning in found.warnings)]
 
 
 def export_calibration(
@@ -48,7 +68,7 @@ def export_calibration(
     gripper_in_camera: bool = False,
 ) -> Exported:
     """The camera of a calibration file, or its hand/eye transform, in another program's format ``kind``: see
-    :func:`~gripmon.calibrate.interchange.write_camera` and :class:`~gripmon.calibrate.interchange.HandEye`, whose
+    :func:`~gripmon.calibrate.interchange.write_camera` and :class:`~gripmon.calibrate.hand_eye_files.HandEye`, whose
     frames have the names ``frames``.  ``command`` is for the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
     source = read_calibrated(path)

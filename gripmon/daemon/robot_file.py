@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from gripmon import __version__
 from gripmon.calibrate.documents import HandEyeCalibration
+from gripmon.calibrate.hand_eye_formats import ForeignHandEye
 from gripmon.daemon.config.checks import reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError, to_settings
@@ -47,12 +49,23 @@ def is_robot_reference(values: dict[str, object]) -> bool:
     return "schema" not in values and ("cam_T_grip" in values or all(name in values for name in _FLANGE))
 
 
+def reference_values(hand_eye: ForeignHandEye) -> dict[str, object]:
+    """Another program's hand/eye transform as such a file's values, the TCP at the gripper's frame."""
+    if hand_eye.covariance is not None:
+        return {"cam_T_grip": _listed(invert(hand_eye.grip_T_cam)), "covariance": list(hand_eye.covariance)}
+    return {"flange_T_cam": _listed(hand_eye.grip_T_cam), "flange_T_tcp": _listed(np.eye(4))}
+
+
+def _listed(transform: Array) -> dict[str, list[float]]:
+    record = to_record(transform)
+    return {"translation_m": list(record.translation_m), "rotation_xyzw": list(record.rotation_xyzw)}
+
+
 def robot_reference(path: Path, values: dict[str, object]) -> ReferenceSettings:
     """The reference that a robot's file says, given what was read of it.  :class:`~gripmon.model.errors.InputError`."""
     if all(name in values for name in _FLANGE):
         flange_T_cam, flange_T_tcp = (_transform(path, values.pop(name), name) for name in _FLANGE)
-        made = to_record(invert(flange_T_cam) @ flange_T_tcp)
-        values["cam_T_grip"] = {"translation_m": list(made.translation_m), "rotation_xyzw": list(made.rotation_xyzw)}
+        values["cam_T_grip"] = _listed(invert(flange_T_cam) @ flange_T_tcp)
     elif "cam_T_grip" not in values:
         raise InputError(f"{path}: contains no hand/eye calibration; {_RIGHT}")
     try:

@@ -12,7 +12,7 @@ from gripmon.model.errors import InputError
 
 _Count = Annotated[int, Meta(ge=2, le=200)]
 _Length = Annotated[float, Meta(gt=0.0, le=2.0)]
-FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9}
+FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9, "acircles": 9}
 """Minimum number of points in a view."""
 _WIDEST = 2.0
 """Largest square, m: a larger number was meant in millimetres."""
@@ -69,11 +69,39 @@ class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_fi
     diameter_m: _Length
 
 
-Target = Chequerboard | Charuco | CircleGrid
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Steps along x and y of every disc from the first, row by row."""
+        return [(column, row) for row in range(self.rows) for column in range(self.columns)]
+
+    @property
+    def step_m(self) -> float:
+        """Length of these steps."""
+        return self.spacing_m
+
+
+class StaggeredCircles(CircleGrid, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="acircles"):
+    """OpenCV's asymmetric circles: discs ``spacing_m`` apart in rows half as far apart, every second one shifted by
+    half of it.  They are a square lattice, too, turned by 45 degrees.
+    """
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Steps along x and y of every disc from the first, row by row."""
+        return [(2 * column + row % 2, row) for row in range(self.rows) for column in range(self.columns)]
+
+    @property
+    def step_m(self) -> float:
+        """Length of these steps: OpenCV's square size."""
+        return 0.5 * self.spacing_m
+
+
+Target = Chequerboard | Charuco | CircleGrid | StaggeredCircles
 _FORMS: dict[str, str] = {
     "chequerboard": "chequerboard:COLUMNSxROWS:SQUARE (inner corners, m), e.g. chequerboard:9x6:0.025",
     "charuco": "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m), e.g. charuco:8x6:0.03:0.022:DICT_4X4_250",
     "circles": "circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), e.g. circles:8x8:0.008:0.004",
+    "acircles": "acircles:COLUMNSxROWS:SPACING:DIAMETER (staggered; in a row, m), e.g. acircles:4x11:0.04:0.015",
 }
 
 
@@ -84,7 +112,7 @@ def parse_target(text: str) -> Target:
     if kind not in _FORMS:
         raise TargetError(f"'{kind}' is not a target; {' or '.join(_FORMS.values())}")
     right = _FORMS[kind]
-    lengths = {"chequerboard": (2, 2), "charuco": (3, 4), "circles": (3, 3)}[kind]
+    lengths = {"chequerboard": (2, 2), "charuco": (3, 4)}.get(kind, (3, 3))
     if not lengths[0] <= len(parts) <= lengths[1]:
         raise TargetError(f"'{text}' has {len(parts)} parts after its kind; {right}")
     try:
@@ -92,10 +120,9 @@ def parse_target(text: str) -> Target:
         numbers = [float(p) for p in parts[1 : 2 if kind == "chequerboard" else 3]]
     except ValueError:
         raise TargetError(f"'{text}' can't be read; {right}") from None
-    keys: dict[str, tuple[str, ...]] = {
-        "chequerboard": ("square_m",), "charuco": ("square_m", "marker_m"), "circles": ("spacing_m", "diameter_m")
-    }  # fmt: skip
-    fields = {"kind": kind, "columns": columns, "rows": rows, **dict(zip(keys[kind], numbers, strict=True))}
+    keys: dict[str, tuple[str, ...]] = {"chequerboard": ("square_m",), "charuco": ("square_m", "marker_m")}
+    names = keys.get(kind, ("spacing_m", "diameter_m"))
+    fields = {"kind": kind, "columns": columns, "rows": rows, **dict(zip(names, numbers, strict=True))}
     if len(parts) == 4:
         fields["dictionary"] = parts[3]
     return checked(fields, text, right)
@@ -111,11 +138,12 @@ def checked(fields: dict[str, object], text: str, right: str) -> Target:
         target: Target = msgspec.convert(fields, Target)
     except msgspec.ValidationError as error:
         raise TargetError(f"'{text}': {error}; {right}") from None
-    inner, outer = {
-        "chequerboard": (0.0, 1.0), "charuco": ("marker_m", "square_m"), "circles": ("diameter_m", "spacing_m")
-    }[str(fields["kind"])]  # fmt: skip
-    if isinstance(inner, str) and not getattr(target, inner) < getattr(target, str(outer)):
+    pairs = {"chequerboard": ("", ""), "charuco": ("marker_m", "square_m")}
+    inner, outer = pairs.get(str(fields["kind"]), ("diameter_m", "spacing_m"))
+    if inner and not getattr(target, inner) < getattr(target, outer):
         raise TargetError(f"'{text}': {inner} is not below {outer}; {right}")
+    if isinstance(target, StaggeredCircles) and not target.diameter_m < math.sqrt(0.5) * target.spacing_m:
+        raise TargetError(f"'{text}': discs would touch those of the next row, {target.step_m:g} m away; {right}")
     columns, rows = (
         (target.columns, target.rows) if fields["kind"] != "charuco" else (target.columns - 1, target.rows - 1)
     )
@@ -132,7 +160,8 @@ def name_of(target: Target) -> str:
     if isinstance(target, Chequerboard):
         return f"chequerboard:{size}:{target.square_m:g}"
     if isinstance(target, CircleGrid):
-        return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
+        kind = target.__struct_config__.tag
+        return f"{kind}:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
     return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
 
 

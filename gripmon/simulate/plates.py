@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.records import Array
-from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, StaggeredCircles, Target
 
 SAMPLES = 2
 """Samples per pixel along each axis."""
@@ -50,6 +50,8 @@ class Print:
 
 def points_of(target: Target) -> Array:
     """All points (n, 3) of a target by rows, in its frame (m)."""
+    if isinstance(target, CircleGrid):
+        return np.column_stack([np.array(target.places) * target.step_m, np.zeros(len(target.places))])
     if isinstance(target, Charuco):
         columns, rows, first = target.columns - 1, target.rows - 1, target.square_m
     else:
@@ -120,7 +122,8 @@ class Plate:
     def _print(self, grid: _Grid) -> Array:
         look, target, step = self.print, self.target, _spacing_m(self.target)
         if isinstance(target, CircleGrid):
-            dark, low, high = _discs(target, look.errors_m, grid), -0.5, (target.columns - 0.5, target.rows - 0.5)
+            right, below = (max(each) for each in zip(*target.places, strict=True))
+            dark, low, high = _discs(target, look.errors_m, grid), -0.5, (right + 0.5, below + 0.5)
         else:
             printed = grid if look.errors_m is None else grid.moved(*_shift(target, look.errors_m, grid))
             if isinstance(target, Charuco):
@@ -181,7 +184,7 @@ def _length(x: Any, y: Any) -> Array:
 
 
 def _spacing_m(target: Target) -> float:
-    return target.spacing_m if isinstance(target, CircleGrid) else target.square_m
+    return target.step_m if isinstance(target, CircleGrid) else target.square_m
 
 
 def _covered(samples: Array) -> Array:
@@ -190,11 +193,12 @@ def _covered(samples: Array) -> Array:
 
 
 def _discs(target: CircleGrid, errors_m: Array | None, grid: _Grid) -> Array:
-    i, j = np.rint(grid.x / target.spacing_m), np.rint(grid.y / target.spacing_m)
-    inside = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows)
-    dx, dy = grid.x - i * target.spacing_m, grid.y - j * target.spacing_m
+    i, j = np.rint(grid.x / target.step_m), np.rint(grid.y / target.step_m)
+    column = 0.5 * (i - j % 2) if isinstance(target, StaggeredCircles) else i
+    inside = (column >= 0) & (column < target.columns) & (column % 1 == 0) & (j >= 0) & (j < target.rows)
+    dx, dy = grid.x - i * target.step_m, grid.y - j * target.step_m
     if errors_m is not None:
-        off = errors_m[np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
+        off = errors_m[np.where(inside, j, 0).astype(int), np.where(inside, column, 0).astype(int)]
         dx, dy = dx - off[..., 0], dy - off[..., 1]
     r = np.maximum(_length(dx, dy), 1e-9)
     return np.where(inside, _covered((0.5 * target.diameter_m - r) / grid.step(dx / r, dy / r)), 0.0)

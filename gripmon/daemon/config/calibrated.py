@@ -8,15 +8,20 @@ from typing import Any
 
 import msgspec
 
+from gripmon.calibrate import camera_files
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration
+from gripmon.calibrate.foreign import UnknownFormatError
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import named_file, read_document
+from gripmon.daemon.config.yaml_file import is_document, named_file, read_document
 from gripmon.model.camera import LensSettings
+from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
+from gripmon.model.provenance import provenance_of
 from gripmon.model.response import Response
 from gripmon.track.edges.taught import gripper_digest
 
-_INTRINSICS, _PLANE = "a file of gripmon calibrate intrinsics", "a file of gripmon calibrate plane"
+_INTRINSICS = "a file of gripmon calibrate intrinsics or another program's camera"
+_PLANE = "a file of gripmon calibrate plane"
 _OR = ", or a section"
 
 
@@ -51,13 +56,36 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
 
 
 def read_camera(path: Path) -> CameraCalibration:
-    """A calibrated camera.  Raises :class:`ConfigError`."""
+    """A calibrated camera, in a file of gripmon calibrate or of another program.  Raises :class:`ConfigError`, for
+    another program's file :class:`~gripmon.model.errors.InputError`.
+    """
+    foreign = foreign_camera(path)
+    if foreign is not None:
+        return foreign
     calibration = read_document(path, CameraCalibration)
     count = len(calibration.parameters)
     if len(calibration.covariance) != count * count:
         wrong = f"has {len(calibration.covariance)} values for {count} parameters"
         raise ConfigError(path, "covariance", wrong, f"{count * count} values, row by row")
     return calibration
+
+
+def foreign_camera(path: Path) -> CameraCalibration | None:
+    """The camera in another program's file, exact; None for a file of gripmon's.
+    :class:`~gripmon.model.errors.InputError` also where ``gripmon calibrate import`` would only warn.
+    """
+    if is_document(path) or not path.is_file():
+        return None
+    try:
+        found = camera_files.read_camera(path.read_bytes(), str(path))
+    except UnknownFormatError:
+        return None
+    if found.warnings:
+        raise InputError(f"{path}: {found.warnings[0]}; gripmon calibrate import with --model brown_conrady or fisheye")
+    return CameraCalibration(
+        camera=found.camera, parameters=(), covariance=(), warnings=(f"{found.kind}: its uncertainty is unknown",),
+        provenance=provenance_of(f"read from {path.name}, a file of {found.kind}", [path]),
+    )  # fmt: skip
 
 
 def mismatch(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.hand_eye_formats import BODY_AXES, lies_along_x
 from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
@@ -78,6 +79,9 @@ def reference_transform(settings: ReferenceSettings) -> Array:
         wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({unit})"
     elif depth_m <= 0.0:
         wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
+        if lies_along_x(translation_m):
+            wrong = f"puts the TCP along the camera's x: {BODY_AXES}"
+            right = "the pose in the camera's optical frame, e.g. camera_color_optical_frame"
     elif depth_m < NEAREST_M:
         wrong = f"puts the TCP {1e3 * depth_m:g} mm in front of the camera"
     if wrong:

@@ -124,6 +124,13 @@ def _other_kind(values: dict[str, Any], wanted: type) -> tuple[str, str] | None:
     return None if mark is None or mark in values else (f"is {given}", _LOOKS_LIKE[mark])
 
 
+def is_document(path: Path) -> bool:
+    """Whether a file has a ``schema``, as those of gripmon have."""
+    with contextlib.suppress(ConfigError):
+        return "schema" in read_yaml(path)
+    return False
+
+
 def read_document(path: Path, kind: type[_T]) -> _T:
     """The content of a file with a ``schema`` as that type.  :class:`ConfigError`."""
     values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]

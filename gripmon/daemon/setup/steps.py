@@ -225,7 +225,7 @@ STEPS = (
             Field("model", "model", "brown_conrady", "auto: the one that fits the images best",
                   ("auto", "brown_conrady", "brown_conrady_5", "fisheye", "paper"),
                   ("intrinsics_by", ("from the images",))),
-            Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or mrcal", (),
+            Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or others", (),
                   ("intrinsics_by", (FROM_FILE,))),
         ), "camera.png",
     ),

@@ -20,7 +20,7 @@ from gripmon.daemon.config.calibrated import mismatch
 from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
-from gripmon.daemon.config.yaml_file import read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import is_document, read_settings, read_yaml
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
 from gripmon.model.camera import Camera, make_camera
@@ -130,7 +130,7 @@ def read_inputs(
         camera_name=camera_name or CAMERA_NAME,
         command=command,
         live=live,
-        calibrations={key: path for key, path in calibrations.items() if path and "schema" in read_yaml(path)},
+        calibrations={key: path for key, path in calibrations.items() if path and is_document(path)},
         jaw_source=jaw_source,
         response=light,
     )

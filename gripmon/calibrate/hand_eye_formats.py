@@ -1,0 +1,243 @@
+"""Hand/eye transforms in other programs' files, recognised by their content: easy_handeye 1 and 2, MoveIt's launch
+files, commands of ``static_transform_publisher``, URDF, and gripmon's own JSON.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
+from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.records import Array
+
+READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
+UNIT_TOLERANCE = 0.01
+"""Largest difference of a quaternion's length from 1: files of four digits are rounded."""
+BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up) instead of a camera's (z forward)"
+_FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
+_CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
+_BASE = re.compile(
+    r"(?!.*(?:grip|hand|tool|flange|tcp))(?:.*[_/])?(?:world|map|odom|base(?:_link|_footprint)?|link_?0|table)$", re.I
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignHandEye:
+    """The camera's pose in the gripper's frame, ``grip_T_cam`` (4, 4), as a file of the format ``kind`` has it, and the
+    covariance (6·6) of ``cam_T_grip`` if it has that.
+    """
+
+    kind: str
+    gripper_frame: str
+    camera_frame: str
+    grip_T_cam: Array
+    covariance: tuple[float, ...] | None = None
+
+
+def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> ForeignHandEye | None:
+    """The hand/eye transform in a file's bytes; None if the file is of none of these formats.  ``which`` names the
+    camera's frame, of several transforms or where neither name looks like a camera's.
+
+    :class:`InterchangeError` for a fixed camera, and for a frame with the axes of ROS bodies in place of a camera's.
+    """
+    document = Document(file, data, READ)
+    found = list(_transforms(document))
+    if not found:
+        return None
+    chosen = [one for one in found if which in one.frames] if which else found
+    if which is None and len(found) > 1:
+        chosen = [one for one in found if any(map(_CAMERA.search, one.frames))] or found
+    if len(chosen) != 1:
+        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in chosen or found)}"
+        raise InterchangeError(file, "", f"holds {len(found)} transforms", right)
+    hand_eye = _turned(file, chosen[0], which)
+    if _is_body(invert(hand_eye.grip_T_cam), hand_eye.camera_frame):
+        wrong = f"ends in {hand_eye.camera_frame}, whose x points along the gripper: {BODY_AXES}"
+        right = f"the pose of its optical frame: ros2 run tf2_ros tf2_echo {hand_eye.gripper_frame} OPTICAL_FRAME"
+        raise InterchangeError(file, "", wrong, right)
+    return hand_eye
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """A transform between two frames; ``camera``: which of them is the camera's, if the file says it."""
+
+    kind: str
+    parent: str
+    child: str
+    parent_T_child: Array
+    camera: str | None = None
+    covariance: tuple[float, ...] | None = None
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        return self.parent, self.child
+
+
+def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
+    """From the gripper to the camera, whichever of both is the parent."""
+    said = pair.camera or which
+    cameras = [name == said if said else bool(_CAMERA.search(name)) for name in pair.frames]
+    if cameras[0] == cameras[1]:
+        right = f"gripmon calibrate import with --camera {pair.child}, or {pair.parent} if that is the camera's"
+        raise InterchangeError(file, "", f"leads from {pair.parent} to {pair.child}: which is the camera's?", right)
+    gripper, camera = pair.frames[:: -1 if cameras[0] else 1]
+    if pair.camera is None and _BASE.match(gripper):
+        raise InterchangeError(file, "", f"leads from {gripper} to {camera}", _FIXED)
+    grip_T_cam = invert(pair.parent_T_child) if cameras[0] else pair.parent_T_child
+    return ForeignHandEye(pair.kind, gripper, camera, grip_T_cam, pair.covariance)
+
+
+def _is_body(cam_T_grip: Array, name: str) -> bool:
+    """Whether the frame's axes are x forward: the gripper points along its x, and lies there or the name isn't an
+    optical frame's.
+    """
+    out, at = cam_T_grip[:3, 2], cam_T_grip[:3, 3]
+    return bool(out[0] > max(abs(out[1]), abs(out[2])) and ("optical" not in name or lies_along_x(at)))
+
+
+def lies_along_x(cam_t_tcp: Array) -> bool:
+    """Whether a place (3,) lies before a ROS body rather than before a camera, along x instead of z."""
+    x, y, z = cam_t_tcp.tolist()
+    return bool(x > max(abs(y), abs(z)))
+
+
+def _transforms(document: Document) -> Iterator[_Pair]:
+    if "static_transform_publisher" in document.text:
+        yield from _published(document)
+        return
+    if document.text.lstrip().startswith("<"):
+        yield from _joints(document)
+        return
+    try:
+        values = document.values(READ)
+    except InterchangeError:  # no YAML: whoever reads cameras says so
+        return
+    content = values.content
+    if "transformation" in content or ("transform" in content and "parameters" in content):
+        yield _easy_handeye(values)
+    elif {"parent_frame", "child_frame", "parent_T_child", "cam_T_grip"} <= content.keys():
+        yield _own_json(values)
+
+
+def _easy_handeye(values: FileValues) -> _Pair:
+    """Version 1 has ``transformation`` (x … qw), ``eye_on_hand``; version 2 ``transform``, ``calibration_type``."""
+    first = "transformation" in values.content
+    told = values.below("parameters") if "parameters" in values.content else values
+    on_hand = told.content.get("eye_on_hand", True) if first else told.content.get("calibration_type") == "eye_in_hand"
+    frames = [str(told.content.get(f"{name}_frame", name)) for name in ("robot_effector", "tracking_base")]
+    if not on_hand:
+        raise values.fault("", f"leads from the robot's base to {frames[1]}", _FIXED)
+    if first:
+        shift = turn = values.below("transformation")
+        keys = ("qx", "qy", "qz", "qw")
+    else:
+        shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
+        keys = ("x", "y", "z", "w")
+    pose = _pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
+    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], pose, frames[1])
+
+
+def _own_json(values: FileValues) -> _Pair:
+    part = values.below("cam_T_grip")
+    shift = part.numbers("translation_m", (3,), "x, y, z")
+    pose = _pose(part, shift, part.numbers("rotation_xyzw", (4,), "x, y, z, w"))
+    parent, child = (str(values.value(f"{name}_frame")) for name in ("parent", "child"))
+    matrix = values.below("parent_T_child").numbers("matrix", (16,), "4 x 4 numbers")
+    # With --gripper-in-camera, the camera's frame is the parent.
+    camera, gripper = (parent, child) if np.allclose(np.reshape(matrix, (4, 4)), pose, atol=1e-9) else (child, parent)
+    covariance = values.numbers("covariance", (36,), "6 x 6 numbers")
+    return _Pair("json", camera, gripper, pose, camera, covariance)
+
+
+def _joints(document: Document) -> Iterator[_Pair]:
+    """Fixed joints of a URDF."""
+    try:
+        root = ElementTree.fromstring(document.text)
+    except (ElementTree.ParseError, ValueError):
+        return
+    for joint in root.iter("joint"):
+        parent, child, origin = (joint.find(name) for name in ("parent", "child", "origin"))
+        if joint.get("type") != "fixed" or parent is None or child is None:
+            continue
+        at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
+        values = FileValues(document.file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
+        shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
+        pose = make_transform(_from_angles(*turn), np.array(shift))
+        yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+
+
+_COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
+_NODE = re.compile(r"<node\b[^>]*static_transform_publisher[^>]*>")
+_ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
+_ARGS = re.compile(r"""\bargs["']?\s*[=:]\s*(?:"([^"]*)"|'([^']*)'|([^\n]*))""")
+_WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
+
+
+def _published(document: Document) -> Iterator[_Pair]:
+    """``static_transform_publisher`` in a shell's line, or in a launch file (Python, XML, YAML), such as MoveIt's."""
+    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
+    kind = "moveit" if "MoveIt" in document.text or "camera_link_broadcaster" in document.text else "static transform"
+    if "EYE-TO-HAND" in document.text:
+        raise InterchangeError(document.file, "", "says EYE-TO-HAND", _FIXED)
+    for part in _NODE.findall(text) or text.split("static_transform_publisher")[1:]:
+        if python := _ARGUMENTS.search(part):
+            words = [quoted or bare for quoted, bare in _WORD.findall(re.sub(r"#[^\n]*", "", python[1]))]
+        else:
+            args = _ARGS.search(part)
+            line = next((each for each in args.groups() if each is not None), "") if args else part.partition("\n")[0]
+            try:
+                words = shlex.split(line)
+            except ValueError as error:
+                raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
+        yield _command(document.file, kind, words)
+
+
+_PUBLISHED = "--x … --qw … --frame-id PARENT --child-frame-id CHILD, or x y z qx qy qz qw PARENT CHILD"
+
+
+def _command(file: str, kind: str, words: list[str]) -> _Pair:
+    """By options, or by place: x y z, then yaw pitch roll or a quaternion, both frames, and ROS 1's period."""
+    words = words[: words.index("--ros-args")] if "--ros-args" in words else words
+    content: Mapping[str, Any]
+    if any(word.startswith("--") for word in words):
+        options = zip(words[::2], words[1::2], strict=False)
+        content = {name.lstrip("-").replace("_", "-"): value for name, value in options}
+    else:
+        words = [word for word in words if not word.startswith("__")]
+        by_quaternion = len(words) > 8 and not re.match(r"[A-Za-z/_]", words[6])
+        keys = ["x", "y", "z", *(("qx", "qy", "qz", "qw") if by_quaternion else ("yaw", "pitch", "roll"))]
+        content = dict(zip([*keys, "frame-id", "child-frame-id"], words, strict=False))
+    values = FileValues(file, content, _PUBLISHED, "static_transform_publisher: ")
+    parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
+    shift = [values.number(key, 0.0) for key in "xyz"]
+    if any(key in content for key in ("roll", "pitch", "yaw")):
+        angles = [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]
+        return _Pair(kind, parent, child, make_transform(_from_angles(*angles), np.array(shift)))
+    quaternion = [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"]
+    return _Pair(kind, parent, child, _pose(values, shift, quaternion))
+
+
+def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
+    """Rotation (3, 3) by angles (rad) about fixed x, y, z, as in URDF."""
+    out = np.eye(3)
+    for axis, angle in enumerate((roll, pitch, yaw)):
+        half = [0.0, 0.0, 0.0]
+        half[axis] = np.sin(0.5 * angle)
+        out = rotation_from_xyzw((*half, np.cos(0.5 * angle))) @ out
+    return out
+
+
+def _pose(values: FileValues, shift: Sequence[float], quaternion: Sequence[float]) -> Array:
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise values.fault("", f"its quaternion has length {length:.4g}", "a unit quaternion")
+    x, y, z, w = quaternion
+    return make_transform(rotation_from_xyzw((x, y, z, w)), np.array(shift))

@@ -1,0 +1,229 @@
+"""Hand/eye transforms as other programs write them, and those that gripmon wrote, read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gripmon.calibrate.foreign import InterchangeError
+from gripmon.calibrate.hand_eye_files import HAND_EYE_FORMATS, HandEye, write_hand_eye
+from gripmon.calibrate.hand_eye_formats import read_hand_eye
+from gripmon.cli import main
+from gripmon.daemon.calibrations import pose_in, read_calibrated
+from gripmon.model.geometry import from_record, invert, to_record
+
+SHIFT, TURN = (0.012, -0.063, -0.119), (-0.258819, 0.0, 0.0, 0.9659258)
+GRIP_T_CAM = np.eye(4)
+GRIP_T_CAM[:3, :3], GRIP_T_CAM[:3, 3] = Rotation.from_quat(TURN).as_matrix(), SHIFT
+X, Y, Z = SHIFT
+QX, QY, QZ, QW = TURN
+ROLL, PITCH, YAW = Rotation.from_quat(TURN).as_euler("xyz")
+FRAMES = "tool0", "camera_color_optical_frame"
+EASY_1 = f"""parameters:
+  eye_on_hand: true
+  freehand_robot_movement: false
+  move_group: manipulator
+  move_group_namespace: /
+  namespace: /ur_eye_on_hand/
+  robot_base_frame: base_link
+  robot_effector_frame: tool0
+  tracking_base_frame: camera_color_optical_frame
+  tracking_marker_frame: aruco_marker_frame
+transformation:
+  qw: {QW}
+  qx: {QX}
+  qy: {QY}
+  qz: {QZ}
+  x: {X}
+  y: {Y}
+  z: {Z}
+"""
+EASY_2 = f"""parameters:
+  name: wrist
+  calibration_type: eye_in_hand
+  robot_base_frame: base_link
+  robot_effector_frame: tool0
+  tracking_base_frame: camera_color_optical_frame
+  tracking_marker_frame: aruco_marker_0
+  freehand_robot_movement: true
+  move_group_namespace: /
+  move_group: manipulator
+transform:
+  translation:
+    x: {X}
+    y: {Y}
+    z: {Z}
+  rotation:
+    x: {QX}
+    y: {QY}
+    z: {QZ}
+    w: {QW}
+"""
+MOVEIT_2 = f'''""" Static transform publisher acquired via MoveIt 2 hand-eye calibration """
+""" EYE-IN-HAND: tool0 -> camera_color_optical_frame """
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description() -> LaunchDescription:
+    nodes = [
+        Node(
+            package="tf2_ros",
+            executable="static_transform_publisher",
+            output="log",
+            arguments=[
+                "--frame-id",
+                "tool0",
+                "--child-frame-id",
+                "camera_color_optical_frame",
+                "--x",
+                "{X}",
+                "--y",
+                "{Y}",
+                "--z",
+                "{Z}",
+                "--qx",
+                "{QX}",
+                "--qy",
+                "{QY}",
+                "--qz",
+                "{QZ}",
+                "--qw",
+                "{QW}",
+                # "--roll",
+                # "9.9",
+                # "--pitch",
+                # "9.9",
+            ],
+        ),
+    ]
+    return LaunchDescription(nodes)
+'''
+MOVEIT_1 = f"""<launch>
+  <!-- The rpy in the comment uses the extrinsic XYZ convention, which is the same as is used in a URDF. See
+       http://wiki.ros.org/geometry2/RotationMethods and https://en.wikipedia.org/wiki/Euler_angles for more info. -->
+  <!-- xyz="9 9 9" rpy="9 9 9" -->
+  <node pkg="tf2_ros" type="static_transform_publisher" name="camera_link_broadcaster"
+      args="{X} {Y} {Z}   {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame" />
+</launch>
+"""
+COMMAND = "ros2 run tf2_ros static_transform_publisher"
+OPTIONS = f"--x {X} --y {Y} --z {Z} --qx {QX} --qy {QY} --qz {QZ} --qw {QW}"
+FILES = {
+    "easy_handeye": EASY_1,
+    "easy_handeye2": EASY_2,
+    "moveit 2": MOVEIT_2,
+    "moveit 1": MOVEIT_1,
+    "static transform, options": f"{COMMAND} {OPTIONS} --frame-id tool0 --child-frame-id camera_color_optical_frame\n",
+    "static transform, over two lines": f"# calibrated on Monday\n{COMMAND} {OPTIONS} \\\n  --frame-id /tool0 "
+    "--child-frame-id camera_color_optical_frame --ros-args -r __node:=a\n",
+    "static transform, angles": f"{COMMAND} --x {X} --y {Y} --z {Z} --roll {ROLL} --pitch {PITCH} --yaw {YAW} "
+    "--frame-id tool0 --child-frame-id camera_color_optical_frame\n",
+    "static transform, by place": f"{COMMAND} {X} {Y} {Z} {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame\n",
+    "static transform, ROS 1's period": "rosrun tf static_transform_publisher "
+    f"{X} {Y} {Z} {YAW} {PITCH} {ROLL} tool0 camera_color_optical_frame 100 __name:=a\n",
+    "static transform, in YAML": f"launch:\n- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n    args: "
+    f'"{OPTIONS} --frame-id tool0 --child-frame-id camera_color_optical_frame"\n',
+    "urdf": '<robot name="r"><joint name="a" type="revolute"><parent link="a"/><child link="b"/></joint>'
+    f'<joint name="cam" type="fixed"><origin xyz="{X} {Y} {Z}" rpy="{ROLL} {PITCH} {YAW}"/><parent link="tool0"/>'
+    '<child link="camera_color_optical_frame"/></joint></robot>',
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_file_gives_the_camera_s_pose_in_the_gripper_s_frame(name: str, tmp_path: Path):
+    found = read_hand_eye(FILES[name].encode(), "their.file")
+    assert found is not None and (found.gripper_frame, found.camera_frame) == FRAMES
+    np.testing.assert_allclose(found.grip_T_cam, GRIP_T_CAM, rtol=0.0, atol=1e-7)
+    assert found.kind == name.partition(",")[0].rstrip(" 12") or found.kind == name
+    # As an option takes it, and imported.
+    path, out = tmp_path / "theirs.yaml", tmp_path / "reference.yaml"
+    path.write_text(FILES[name])
+    assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
+    for file in (path, out):
+        np.testing.assert_allclose(pose_in(file)[0] @ GRIP_T_CAM, np.eye(4), rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("kind", HAND_EYE_FORMATS)
+def test_what_is_exported_is_imported_as_it_was(kind: str, turned: bool, tmp_path: Path):
+    if turned and kind == "easy_handeye2":
+        pytest.skip("has one direction only")
+    covariance = tuple((np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) ** 2).ravel().tolist())
+    hand_eye = HandEye(to_record(invert(GRIP_T_CAM)), covariance, gripper_in_camera=turned)
+    path, out = tmp_path / "written", tmp_path / "reference.yaml"
+    path.write_text(write_hand_eye(hand_eye, kind, ["gripmon calibrate export 'a--b.yaml' --format x"]))
+    assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
+    for file in (path, out):
+        back = read_calibrated(file)
+        assert back.cam_T_grip is not None
+        np.testing.assert_allclose(from_record(back.cam_T_grip) @ GRIP_T_CAM, np.eye(4), rtol=0.0, atol=1e-12)
+        if kind == "json":  # the only one that holds it
+            assert back.covariance == covariance
+
+
+def body(frame: str) -> str:
+    """The same camera's pose, of a frame with x forward, y left and z up."""
+    optical_T_body = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    qx, qy, qz, qw = Rotation.from_matrix(GRIP_T_CAM[:3, :3] @ optical_T_body).as_quat()
+    return f"{COMMAND} {X} {Y} {Z} {qx} {qy} {qz} {qw} tool0 {frame}\n"
+
+
+@pytest.mark.parametrize("frame", ["camera_link", "zed_left_camera_frame", "wrist_optical_frame"])
+def test_a_camera_link_is_recognised_by_its_axes_and_named(frame: str):
+    said = rf"ends in {frame}, whose x points along the gripper: the axes of a ROS body such as camera_link \(x forward"
+    with pytest.raises(InterchangeError, match=said):
+        read_hand_eye(body(frame).encode(), "x")
+    # A frame that is called a link, but has a camera's axes, is a camera's.
+    assert read_hand_eye(FILES["moveit 1"].replace(FRAMES[1], "camera_link").encode(), "x") is not None
+
+
+REFUSED = [
+    (EASY_1.replace("eye_on_hand: true", "eye_on_hand: false"), "robot's base to camera_color_optical_frame; is a"),
+    (EASY_2.replace("eye_in_hand", "eye_on_base"), "is a fixed camera's pose; gripmon calibrate robot-world"),
+    (MOVEIT_2.replace("EYE-IN-HAND", "EYE-TO-HAND"), "says EYE-TO-HAND; is a fixed camera's"),
+    (MOVEIT_1.replace("tool0", "base_link"), "leads from base_link to camera_color_optical_frame; is a fixed"),
+    (MOVEIT_1.replace("tool0", "panda_link0"), "leads from panda_link0 to"),
+    (EASY_1.replace("  qw: 0.9", "  qw: 0.7"), "its quaternion has length 0.8"),
+    (EASY_1.replace("  z: -0.119\n", ""), "transformation.z: is missing"),
+    (EASY_2.replace("y: -0.063", "y: much"), "transform.translation.y: 'much' is not a number"),
+    (FILES["static transform, options"].replace("--child-frame-id", "--other"), "child-frame-id: is missing; --x"),
+    (FILES["static transform, by place"].replace(FRAMES[1], "thing"), "which is the camera.s.* --camera thing, or"),
+    (body("a_cam") + body("b_cam"), "holds 2 transforms; gripmon calibrate import with --camera a_cam or b_cam"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "said"), REFUSED)
+def test_what_is_no_hand_eye_transform_is_said_in_one_line(text: str, said: str):
+    with pytest.raises(InterchangeError, match=said) as refused:
+        read_hand_eye(text.encode(), "their.file")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_name_says_which_frame_is_the_camera_s():
+    text = FILES["static transform, by place"].replace("camera_color_optical_frame", "thing")
+    for which, expected in (("thing", GRIP_T_CAM), ("tool0", invert(GRIP_T_CAM))):
+        found = read_hand_eye(text.encode(), "x", which=which)
+        assert found is not None
+        np.testing.assert_allclose(found.grip_T_cam, expected, rtol=0.0, atol=1e-7)
+    several = FILES["static transform, by place"] + f"{COMMAND} 1 0 0 0 0 0 1 world table\n"
+    found = read_hand_eye(several.encode(), "x")
+    assert found is not None and found.camera_frame == FRAMES[1]
+
+
+def test_a_flange_behind_the_camera_is_imported_and_completed_by_hand(tmp_path: Path, capsys):
+    """A flange is no TCP: where the TCP is in the flange's frame is one line of the file."""
+    path, out = tmp_path / "theirs.calib", tmp_path / "reference.yaml"
+    path.write_text(EASY_2.replace(f"z: {Z}", "z: 0.074"))
+    assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
+    assert "if the TCP isn't at tool0 (x across the jaws, z out): flange_T_tcp" in capsys.readouterr().out
+    assert main(["calibrate", "verify", str(out), str(out)]) == 2
+    assert "behind the camera" in capsys.readouterr().err
+    text = out.read_text()
+    out.write_text(text.replace("[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.2]"))
+    assert out.read_text() != text and main(["calibrate", "verify", str(out), str(out)]) == 0
+    assert main(["calibrate", "import", str(path), "--model", "fisheye", "--out", str(tmp_path / "x.yaml")]) == 2
+    assert "is a hand/eye transform (easy_handeye2)" in capsys.readouterr().err
