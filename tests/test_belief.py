@@ -320,6 +320,7 @@ def test_a_line_of_its_own_where_nobody_looked_is_not_missed() -> None:
         places = frame.searched[1] + np.array([off_px, 0.0])
         of, log, unsearched = which(frame, 1, places, np.full((1, 2), 1e-3), sizes)
         assert of == -1 and log == pytest.approx(np.log(missed) + anything)
+        assert unsearched == (missed == 1.0)
 
 
 def test_what_lies_flush_over_the_ends_is_no_slide() -> None:
@@ -625,6 +626,32 @@ def test_a_thing_seen_elsewhere_is_missed_where_it_was() -> None:
             log += foreign(bank, 0, seen, 0, t == 0, True, sizes, np.zeros(2), np.zeros(2), True, True)
         logs.append(log)
     assert logs[0] < logs[1] - 10.0
+
+
+def test_what_lies_where_the_gripper_is_not_is_counted_once() -> None:
+    """A line of the gripper's own housing, seen by a search 40 px beside the edge: in every frame the same."""
+    belief = Belief(of_edges(8, 2), ALONG, replace(STEADY, missed=0.05))
+    for frame in frames_of(np.random.default_rng(12), 8, 12, 0.5, clean=True):
+        frame.seen.lines[0, 0] += [40.0, 0.0]
+        frame.seen.searched[0, 0] += [40.0, 0.0]
+        frame.seen.image[0, 0] = frame.seen.lines[0, 0]
+        believed = belief.update(frame.seen, DT_S)
+    assert believed.known and np.linalg.norm(believed.motion[:3]) < believed.bound.position_m < 1e-3
+    assert sum(weight for doubts, weight in belief.weights.items() if doubts & 1) < 0.1
+
+
+def test_what_surprises_may_have_been_a_knock() -> None:
+    """Of four edges one jumps by half a pixel: by chance that is rare, and what knocks moves them all."""
+    bounds = {}
+    for unseen_knock in (1e-3, 1e-15):
+        frames = frames_of(np.random.default_rng(5), 4, 8, 0.5, clean=True)
+        priors = replace(STEADY, small_per_s=1e-15, unseen_knock=unseen_knock)
+        belief = Belief([Doubt(np.arange(4) < 1, Rates(0.0, 0.0), np.zeros(1, bool))], ALONG, priors)
+        frames[-1].seen.lines[0, 0] += [0.7, 0.0]
+        bounds[unseen_knock] = [belief.update(frame.seen, DT_S).bound.position_m for frame in frames][-2:]
+    usual, surprised = bounds[1e-3]
+    assert usual == pytest.approx(bounds[1e-15][0], rel=0.1)
+    assert surprised > 1.5 * bounds[1e-15][1]
 
 
 def test_an_answer_heard_before_is_little_news() -> None:

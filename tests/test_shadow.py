@@ -15,11 +15,12 @@ from gripmon.model.camera import make_camera
 from gripmon.model.poses import perturb
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.edge_lines import Frame2d, Line, lines_of, merged
+from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
 from gripmon.monitor.shadow import Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
 from gripmon.track.edges import Measurement
+from gripmon.track.edges.prediction import EdgeLayout
 
 FRAME_S = 1.0 / 30.0
 
@@ -159,7 +160,7 @@ def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None
 
 
 def test_a_line_that_stands_still_is_the_same_line_whatever_is_seen_of_it() -> None:
-    """Two stretches of one line, in the frame of the edge that was seen there first."""
+    """Two parts of one line, in the frame of the edge that was seen there first."""
     frame = Frame2d(np.array([100.0, 50.0]), np.array([20.0, 0.0]))
     for first, last in ((80.0, 120.0), (115.0, 160.0)):
         x = np.linspace(first, last, 12)
@@ -167,6 +168,16 @@ def test_a_line_that_stands_still_is_the_same_line_whatever_is_seen_of_it() -> N
         assert place == pytest.approx([2.0, 2.0], abs=1e-9)
         basis = np.column_stack([np.ones(12), (x - 100.0) / 20.0])
         assert variance == pytest.approx(np.diag(np.linalg.inv(basis.T @ basis)))
+
+
+def test_a_curve_is_several_edges_of_the_belief() -> None:
+    """A straight border touches an arc in a part of it: in another the slopes differ."""
+    parts = Parts(np.array([False, True]))
+    assert len(parts) == 3 and parts.edge.tolist() == [0, 1, 1]
+    edge, fraction = np.repeat([0, 1], 4), np.tile([0.0, 0.4, 0.6, 1.0], 2)
+    two = np.ones(2, bool)
+    layout = EdgeLayout(edge, fraction, np.array([0, 1]), np.array([0, 4]), two, ~two)
+    assert parts.of(layout).tolist() == [0, 0, 0, 0, 1, 1, 2, 2]
 
 
 def test_a_line_of_two_looks_is_one_and_the_fits_own_is_named() -> None:

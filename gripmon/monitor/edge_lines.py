@@ -24,17 +24,17 @@ PLACES_PX = np.array([(offset, slope) for offset in np.arange(-7.0, 7.01, 0.3) f
 """Where lines are looked for (offset, slope): as far as search lines reach."""
 
 
-STRETCHES = 2
+PARTS = 2
 """Parts of a curve: the fewest whose slopes tell whether it bends."""
 
 
-class Stretches:
+class Parts:
     """The s edges that the belief knows of a gripper: a straight one is one, a ``curved`` (e,) one several, else what
     is straight would be taken for it.  ``edge`` (s,) is that of each.
     """
 
     def __init__(self, curved: Flags) -> None:
-        self._count = np.where(curved, STRETCHES, 1)
+        self._count = np.where(curved, PARTS, 1)
         self._first = np.cumsum(self._count) - self._count
         self.edge = np.repeat(np.arange(len(curved)), self._count)
 
@@ -84,20 +84,20 @@ class Frame2d(NamedTuple):
 
 
 def found_at(
-    look: Measurement, columns: Array, away: Array, reported_m: float, frames: dict[int, Frame2d], stretches: Stretches
+    look: Measurement, columns: Array, away: Array, reported_m: float, frames: dict[int, Frame2d], parts: Parts
 ) -> list[list[Line]]:
-    """The lines of each stretch in a look at an image that starts ``away`` (6,) from the reference, whose search lines
+    """The lines of each part in a look at an image that starts ``away`` (6,) from the reference, whose search lines
     change by ``columns`` (n, 23) with g; ``reported_m``: the opening that was reported.  ``frames`` get those of
-    stretches that are seen for the first time.
+    parts that are seen for the first time.
     """
     p, c, fit = look.prediction, look.candidates, look.consensus
     from_reference = columns[:, MOTION] @ away + columns[:, OPENING] * (p.jaw_opening_m - reported_m)
-    out: list[list[Line]] = [[] for _ in range(len(stretches))]
-    lies_on = stretches.of(p.layout)
-    for stretch in np.unique(lies_on[c.sample]).tolist():
-        own, edge = np.flatnonzero(lies_on[c.sample] == stretch), int(stretches.edge[stretch])
+    out: list[list[Line]] = [[] for _ in range(len(parts))]
+    lies_on = parts.of(p.layout)
+    for part in np.unique(lies_on[c.sample]).tolist():
+        own, edge = np.flatnonzero(lies_on[c.sample] == part), int(parts.edge[part])
         agree = fit.weight[own] > 0.0 if fit.edge_seen[edge] else np.zeros(len(own), bool)
-        search_lines = int(np.count_nonzero(lies_on == stretch))
+        search_lines = int(np.count_nonzero(lies_on == part))
         found = lines_of(c.offset_px[own], c.sample[own], p.layout.fraction[c.sample[own]], agree, search_lines)
         if not found:
             continue
@@ -105,13 +105,13 @@ def found_at(
         sample, fraction = c.sample[first], p.layout.fraction[c.sample[first]]
         line = _line(_basis(fraction, fraction), 1.0 / np.square(c.sigma_px[first]))
         both = line @ np.column_stack([from_reference[sample], columns[sample]])
-        if stretch not in frames:
+        if part not in frames:
             ends_px = p.uv_px[sample[[int(np.argmin(fraction)), int(np.argmax(fraction))]]]
-            frames[stretch] = Frame2d(ends_px.mean(axis=0), 0.5 * (ends_px[1] - ends_px[0]))
+            frames[part] = Frame2d(ends_px.mean(axis=0), 0.5 * (ends_px[1] - ends_px[0]))
         for on in found:
             points = own[on]
             at_px = p.uv_px[c.sample[points]] + c.offset_px[points, None] * p.normal[c.sample[points]]
-            image, loose = frames[stretch].line(at_px, 1.0 / np.square(c.sigma_px[points]))
+            image, loose = frames[part].line(at_px, 1.0 / np.square(c.sigma_px[points]))
             basis = _basis(p.layout.fraction[c.sample[points]], fraction)
             place = _line(basis, 1.0 / np.square(c.sigma_px[points])) @ c.offset_px[points]
             left = c.offset_px[points] - basis @ place
@@ -123,7 +123,7 @@ def found_at(
             independent = max(float(p.independence[edge]) * len(points), 2.0)
             white, unsure = (LEAST_WHITE_PX**2 + spread * of for of in (single, loose / float(p.independence[edge])))
             away_px, searched_px = place + both[:, 0], both[:, 0]
-            out[stretch].append(Line(rows, away_px, white, searched_px, image, unsure, independent, step, on is agree))
+            out[part].append(Line(rows, away_px, white, searched_px, image, unsure, independent, step, on is agree))
     return out
 
 

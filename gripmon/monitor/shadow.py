@@ -19,7 +19,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
-from gripmon.monitor.edge_lines import Frame2d, Stretches, found_at, merged
+from gripmon.monitor.edge_lines import Frame2d, Parts, found_at, merged
 from gripmon.monitor.ends_told import EndsTold
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -64,16 +64,16 @@ class Shadow:
         covariance[REFERENCE, REFERENCE] = np.reshape(reference.covariance, (6, 6))
         covariance[OPENING, OPENING] = max(math.hypot(settings.jaw_sigma_m, settings.jaw_offset_sigma_m), 1e-6) ** 2
         covariance[LENGTHS, LENGTHS] = np.eye(2) * max(tracker.model_sigma_m, 1e-6) ** 2
-        self._stretches = Stretches(gripper.edge_curved)
-        ends = (edges_at_ends(gripper) & ~tracker.along)[self._stretches.edge]
-        finger_of = gripper.edge_finger[self._stretches.edge]
+        self._parts = Parts(gripper.edge_curved)
+        ends = (edges_at_ends(gripper) & ~tracker.along)[self._parts.edge]
+        finger_of = gripper.edge_finger[self._parts.edge]
         self._ends_of = [ends & (finger_of == finger) for finger in range(len(gripper.finger_ids))]
         self._belief = Belief(
-            doubts_of(gripper, tracker.along, self._ends_of, self._stretches.edge), self._axis, priors,
+            doubts_of(gripper, tracker.along, self._ends_of, self._parts.edge), self._axis, priors,
             risk=settings.policy.integrity_risk, covariance=covariance,
         )  # fmt: skip
-        self._beside = np.full((len(self._stretches), 2, BESIDE_POINTS), np.nan)  # of each, before a background
-        self._like = np.zeros(len(self._stretches))  # how like that is to what was seen of it last
+        self._beside = np.full((len(self._parts), 2, BESIDE_POINTS), np.nan)  # of each, before a background
+        self._like = np.zeros(len(self._parts))  # how like that is to what was seen of it last
         self._floor_px = settings.corners.consensus.edge_floor_px  # what averaging along an edge doesn't remove
         self._frames: dict[int, Frame2d] = {}
         self._last_s: float | None = None
@@ -111,8 +111,8 @@ class Shadow:
         return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
 
     def _told(self, frame: Frame, looks: list[Measurement], fit: Measurement, now_s: float) -> Told:
-        rows, at = np.zeros((len(self._stretches), SIZE)), np.zeros((len(looks), SIZE))
-        lies_on, columns = self._stretches.of(looks[0].prediction.layout), self._columns(looks[0])
+        rows, at = np.zeros((len(self._parts), SIZE)), np.zeros((len(looks), SIZE))
+        lies_on, columns = self._parts.of(looks[0].prediction.layout), self._columns(looks[0])
         for edge in np.unique(lies_on):
             rows[edge] = columns[lies_on == edge].mean(axis=0)
         for k, look in enumerate(looks):
@@ -142,13 +142,13 @@ class Shadow:
 
     def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
         """The frame's edges, of several looks at it; None with too few of them."""
-        main, edges = looks[0], len(self._stretches)
+        main, edges = looks[0], len(self._parts)
         assert isinstance(frame.image, np.ndarray)
         noise = main.candidates.noise / math.sqrt(3.0)  # of three pixels
-        beside = _beside(frame.image, main, self._stretches)
+        beside = _beside(frame.image, main, self._parts)
         away = [perturbation_between(self._ref_T, look.prediction.cam_T_grip) for look in looks]
         found = [
-            found_at(look, self._columns(look), at, self._reported_m(frame), self._frames, self._stretches)
+            found_at(look, self._columns(look), at, self._reported_m(frame), self._frames, self._parts)
             for look, at in zip(looks, away, strict=True)
         ]
         by = next(k for k, look in enumerate(looks) if look is fit)
@@ -169,7 +169,7 @@ class Shadow:
                 strength[edge] = min(texture, MOST_TEXTURE_PX) ** 2 + self._floor_px**2
         count = np.array([len(of) for of, _ in all_lines])
         shown = count > 0
-        if len(np.unique(self._stretches.edge[shown])) < FEWEST_EDGES:
+        if len(np.unique(self._parts.edge[shown])) < FEWEST_EDGES:
             return None
         likeness = np.array([self._compare(e, beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         background = np.zeros(edges, np.int64)
@@ -194,7 +194,7 @@ class Shadow:
             out[:, OPENING] = p.jacobian[:, 6]
         along = p.jacobian[:, :3] @ (p.cam_T_grip[:3, :3] @ self._tracker.finger_axis)
         for finger, ends in enumerate(self._ends_of[:2]):
-            out[:, LENGTHS.start + finger] = np.where(ends[self._stretches.of(p.layout)], along, 0.0)
+            out[:, LENGTHS.start + finger] = np.where(ends[self._parts.of(p.layout)], along, 0.0)
         camera = self._camera
         centre = np.array([camera.cx_px, camera.cy_px])
         out[:, FOCAL] = np.einsum("ni,ni->n", p.normal, p.uv_px - centre)
@@ -208,7 +208,7 @@ def _near(look: Measurement, cam_T_grip: Array) -> bool:
 
 
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags], edge: Ints) -> list[Doubt]:
-    """What may be wrong with a gripper's s stretches, of each of which the ``edge`` (s,) is given; ``along`` (e,), and
+    """What may be wrong with a gripper's s parts, of each of which the ``edge`` (s,) is given; ``along`` (e,), and
     of each finger its ``ends_of`` (s,).
     """
     count, fingers = len(edge), len(gripper.finger_ids)
@@ -227,21 +227,21 @@ def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags], edge: Ints) 
     return out
 
 
-def _beside(image: Image, measurement: Measurement, stretches: Stretches) -> Array:
-    """(s, 2, p) grey levels to both sides of the stretches, each the mean of three pixels across; NaN of those out of
+def _beside(image: Image, measurement: Measurement, parts: Parts) -> Array:
+    """(s, 2, p) grey levels to both sides of the parts, each the mean of three pixels across; NaN of those out of
     view.
     """
     p = measurement.prediction
-    grey = np.full((len(stretches), 2, BESIDE_POINTS), np.nan)
+    grey = np.full((len(parts), 2, BESIDE_POINTS), np.nan)
     moved = (p.jacobian @ measurement.consensus.xi)[:, None] * p.normal
-    lies_on = stretches.of(p.layout)
-    for stretch in np.unique(lies_on):
-        own = np.flatnonzero(lies_on == stretch)
+    lies_on = parts.of(p.layout)
+    for part in np.unique(lies_on):
+        own = np.flatnonzero(lies_on == part)
         own = own[np.linspace(0, len(own) - 1, BESIDE_POINTS).astype(int)]
         for side, way in enumerate((-BESIDE_PX, BESIDE_PX)):
             uv = p.uv_px[own] + moved[own] + way * p.normal[own]
             maps = np.array([uv + k * p.normal[own] for k in (-1.0, 0.0, 1.0)], np.float32)
-            grey[stretch, side] = read_profiles(image, maps[..., 0], maps[..., 1]).mean(axis=0)
+            grey[part, side] = read_profiles(image, maps[..., 0], maps[..., 1]).mean(axis=0)
     return grey
 
 
