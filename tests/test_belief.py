@@ -15,8 +15,9 @@ from gripmon.belief import bound
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import Doubt, Rates, Table, Told, log_told, of_edges, of_ends, of_mount
 from gripmon.belief.nodes import prepare, which
-from gripmon.belief.rows import fade, foreign
+from gripmon.belief.rows import fade
 from gripmon.belief.state import LATELY, MOTION, SIZE, Bank, Priors, Seen
+from gripmon.belief.things import foreign
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 

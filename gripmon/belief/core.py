@@ -16,10 +16,11 @@ from scipy import stats
 
 from gripmon.belief import bound as bounds
 from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, flags_of, nothing_told
+from gripmon.belief.ends import lie_across, look
 from gripmon.belief.held import follow
 from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
-from gripmon.belief.nodes import Nodes, lie_across, look, prepare
+from gripmon.belief.nodes import Nodes, prepare
 from gripmon.belief.rows import add_noise, fade, move
 from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search, take_one_of
 from gripmon.belief.state import (

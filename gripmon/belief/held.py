@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from gripmon.belief.nodes import Nodes
-from gripmon.belief.rows import forward, normal, not_drawn, strength_of
+from gripmon.belief.rows import forward, normal, strength_of
 from gripmon.belief.state import SIZE, Bank, Seen
+from gripmon.belief.things import not_drawn
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 

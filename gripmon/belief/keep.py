@@ -7,10 +7,12 @@ import math
 import numpy as np
 
 from gripmon.belief.doubts import Table, edges_of
-from gripmon.belief.nodes import Nodes, across, weigh
-from gripmon.belief.rows import add_noise, foreign, forget, forward, learn, not_drawn
+from gripmon.belief.ends import across
+from gripmon.belief.nodes import Nodes, weigh
+from gripmon.belief.rows import add_noise, forward, learn
 from gripmon.belief.search import Candidates
 from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
+from gripmon.belief.things import foreign, forget, not_drawn
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 

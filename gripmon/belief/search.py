@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.belief.doubts import Chances, Table, Told, edges_of, log_told, log_transition
-from gripmon.belief.nodes import Nodes, across, weigh, without
+from gripmon.belief.ends import across
+from gripmon.belief.nodes import Nodes, weigh, without
 from gripmon.belief.state import SIZE, Bank, Flags, Ints, Seen
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gripmon.belief.doubts import Told
-from gripmon.belief.nodes import LOOKED_PX
+from gripmon.belief.ends import LOOKED_PX
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.edges import FingerEndsSeen, Measurement

@@ -12,7 +12,7 @@ import numpy as np
 
 from gripmon.belief.core import Belief, Believed
 from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
-from gripmon.belief.nodes import LOOKED_PX
+from gripmon.belief.ends import LOOKED_PX
 from gripmon.belief.state import FOCAL, LENGTHS, MOTION, OPENING, REFERENCE, SIZE, Flags, Ints, Priors, Seen
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record
