@@ -44,7 +44,8 @@ GUARD = 20.0
 """No hypothesis is believed beyond a surprise that the right one exceeds with at most e^-20 (once a year at 15/s)."""
 NOT_KNOWN_WEIGHT = 0.1
 """Of the hypothesis that the pose isn't known, while the guard stops: policy."""
-_MOST_CANDIDATES = 4096
+_MOST_CANDIDATES = 16384
+"""Sets weighed in a frame; where there are more, what wasn't weighed isn't known, and there is no bound."""
 _OF_SIZES = 10.0
 """Into how many parts a knock falls by its size and way; the smallest is a twentieth."""
 _MOST_LISTED = 256
@@ -171,7 +172,7 @@ class Belief:
         usual = math.sqrt(2.0 * GUARD * int(seen.shown.sum())) + GUARD
         was_lost, self._lost, self._first = self._lost, not surprise <= usual, False
         if not self._lost:
-            dropped = self._keep(n, asked)
+            dropped = self._keep(n, asked) + float(n >= len(self._candidates.node))
         else:  # nothing is learnt from what nothing explains
             dropped = 0.0
             if not was_lost:
