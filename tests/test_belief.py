@@ -75,10 +75,11 @@ def frames_of(
 
 def told(frame: Frame) -> Told:
     """Looked at in one place, where everything is."""
-    nowhere = np.zeros((len(frame.seen.found), SIZE))
+    nowhere = np.full((len(frame.seen.found), SIZE), 1e-9)
     return Told(
-        np.log(frame.right)[None], np.log(frame.wrong)[None], np.array([frame.memory]), 1.0 * frame.repeats[None],
-        np.log(frame.together)[None], np.array([1.0 * frame.repeats.all()]), nowhere, np.zeros((1, SIZE)), 0,
+        np.log(frame.right)[None], np.log(frame.wrong)[None], np.full((1, 2), frame.memory), 1.0 * frame.repeats[None],
+        np.log(frame.together)[None], np.array([frame.memory]), np.array([1.0 * frame.repeats.all()]), nowhere,
+        np.zeros((1, SIZE)), 0,
     )  # fmt: skip
 
 
@@ -658,10 +659,11 @@ def test_what_surprises_may_have_been_a_knock() -> None:
 def test_an_answer_heard_before_is_little_news() -> None:
     """An answer that comes and goes tells as little as one that stays."""
     table = Table.of(of_ends([np.array([True, False])]))
-    told = Told(*np.log([[[0.1]], [[0.8]]]), np.zeros(1), np.zeros((1, 1)), np.full((1, 2), np.nan), np.zeros(1),
-                np.zeros((2, SIZE)), np.zeros((1, SIZE)), 0)  # fmt: skip
-    news = [log_told(0, 0, table, told._replace(memory=np.array([m]), repeats=np.array([[r]])), False, np.zeros(1, int))
-            for m, r in ((0.0, 0.0), (0.95, 0.0), (0.95, 0.5), (0.95, 1.0))]  # fmt: skip
+    none, one = np.full((1, 2), np.nan), np.zeros(1)
+    told = Told(*np.log([[[0.1]], [[0.8]]]), one[None], one[None], none, one, one, np.zeros((2, SIZE)),
+                np.zeros((1, SIZE)), 0)  # fmt: skip
+    news = [log_told(0, 0, table, told._replace(memory=np.array([[m]]), repeats=np.array([[r]])), False,
+                     np.zeros(1, int)) for m, r in ((0.0, 0.0), (0.95, 0.0), (0.95, 0.5), (0.95, 1.0))]  # fmt: skip
     assert news[0] == pytest.approx(np.log(0.1 / 0.8)) and news[1] == pytest.approx(news[0])
     assert news[1] < news[2] < news[3] < 0.0
     assert news[2] == pytest.approx(np.log((0.475 + 0.005) / (0.475 + 0.04)))
@@ -672,7 +674,8 @@ def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:
     table = Table.of(of_ends([np.array([True, False]), np.array([False, True])]))
     right, wrong = np.array([[0.5, 0.4], [0.3, 0.2]]), np.array([[0.1, 0.2], [0.6, 0.7]])
     zeros, never = np.zeros((2, SIZE)), np.full((2, 2), np.nan)
-    told = Told(np.log(right), np.log(wrong), np.zeros(2), np.zeros((2, 2)), never, np.zeros(2), zeros, zeros, 0)
+    two = np.zeros(2)
+    told = Told(np.log(right), np.log(wrong), np.zeros((2, 2)), np.zeros((2, 2)), never, two, two, zeros, zeros, 0)
     for looked, expected in (((0, 0), 10.0), ((-1, 0), 2.0), ((0, 1), 10.0 / 7.0), ((-1, -1), 1.0)):
         assert np.exp(log_told(0, 0, table, told, True, np.array(looked))) == pytest.approx(expected)
 

@@ -204,6 +204,9 @@ def failed(arguments: list[str], capsys) -> tuple[int, str]:
         ("c.jsonl", "stamp_ns\n12.5\n", "line 2: '12.5'"),
         ("c.jsonl", "stamp_ns\n99999999999999999999\n", "line 2"),
         ("c.jsonl", "stamp_ns\n", "no capture times"),
+        ("c.jsonl", "stamp_ns\n1,718,000\n", "line 2 has 3 values; 1"),
+        ("c.jsonl", "stamp_ns,other\n1\n", "line 2 has 1 values; 2"),
+        ("c.jsonl", "stamp_ns,stamp_ns\n1,2\n", "several columns stamp_ns"),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_code_2(estimates: Path, tmp_path: Path, capsys, out, stamps, says):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -9,17 +11,18 @@ from support.meters import box_gripper, difference, moved
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
 from support.watched import frames_of, new_monitor, reference_of, watched
 
-from gripmon.belief.doubts import Told
+from gripmon.belief.doubts import Told, log_told
 from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, SIZE, Seen
 from gripmon.model.camera import make_camera
 from gripmon.model.poses import perturb
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
+from gripmon.monitor.ends_told import EndsTold
 from gripmon.monitor.shadow import Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
-from gripmon.track.edges import Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.edges.prediction import EdgeLayout
 
 FRAME_S = 1.0 / 30.0
@@ -229,6 +232,10 @@ def test_ends_are_asked_wherever_the_frame_was_searched() -> None:
     assert away[there] > 5e-3 > 1e-4 > away[old] and told.fit == there
     assert (told.right[there] > told.wrong[there]).all() and (told.right[old] < told.wrong[old]).all()
     assert (told.memory == 0.0).all()
+    unasked = EndsTold(2).told([FingerEndsSeen(*np.zeros((3, 2), int))], [fit], told.rows, told.at[:1], 0, 0.0)
+    table = shadow._belief._table
+    for before, after in itertools.product((0, int(table.ends[0])), repeat=2):
+        assert log_told(before, after, table, unasked, False, np.zeros(2, int)) == 0.0
     shadow.see(frame, fit, FRAME_S)
     assert (shadow.told.memory[[there, old]] > 0.4).all() and (shadow.told.repeats[[there, old]] == 1.0).all()
 

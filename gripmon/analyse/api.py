@@ -148,12 +148,18 @@ def _stamps(path: Path) -> NDArray[np.int64]:
     """The column ``stamp_ns`` of a CSV file."""
     stamps = []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
-            if "stamp_ns" not in (rows.fieldnames or ()):
+            names = [*(rows.fieldnames or ())]
+            if names.count("stamp_ns") != 1:
                 right = "a first line with the columns' names, capture times in Unix ns"
-                raise InputError(f"{path}: has no column stamp_ns; {right}", "stamps")
+                has = "several columns" if names.count("stamp_ns") else "no column"
+                raise InputError(f"{path}: has {has} stamp_ns; {right}", "stamps")
             for row in rows:
+                if None in row or None in row.values():
+                    count = len(names) + (len(row[None]) if None in row else -list(row.values()).count(None))
+                    wrong = f"line {rows.line_num} has {count} values; {len(names)}, as the first line"
+                    raise InputError(f"{path}: {wrong}", "stamps")
                 try:
                     stamps.append(np.int64(int(row["stamp_ns"] or "")))
                 except (ValueError, OverflowError):

@@ -85,7 +85,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         commands=tuple(
             CommandEntry(track.time_of(c.seq, c.stamp_ns), c.name, c.argument, c.done, c.text) for c in source.commands
         ),
-        missable_m=missable_m,
+        missable_m=None if missable_m is None else max(missable_m, limits.affected_m),  # smaller ones aren't told
         integrity=integrity_of(table, limits),
         faults=(*(fault for fault in source.faults if fault not in dropped), *track.faults),
     )

@@ -311,8 +311,8 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
     missable_m: Annotated[
         float | None,
         _is(
-            "a step of the TCP without an alert may be missing among the events up to that size, since two backgrounds "
-            "may differ by it; null: not known",
+            "a step of the TCP without an alert may be missing among the events up to that size: two backgrounds may "
+            "differ by it, or it is no more than what counts as affected; null: not known",
             "Steps may be missing up to",
             millimetres,
         ),

@@ -104,6 +104,7 @@ def make_track(
     """``known_error`` (6,): the configured reference's error as estimated by the monitor, if known."""
     poses = table.matrices()
     measured = np.isfinite(table.cam_T_grip).all(axis=1) & (table.source != table.ORIGINS.index("held"))
+    measured &= np.linalg.norm(table.cam_T_grip[:, 3:7], axis=1) > 0.0  # a quaternion of zeros turns nothing
     sigma = np.sqrt(np.maximum(np.diagonal(table.covariance, axis1=1, axis2=2), 0.0))
     sigma[~measured] = np.nan
     named = list(zip(table.reference.tolist(), table.revision.tolist(), strict=True))
@@ -132,7 +133,9 @@ def _inferred_T(table: FrameTable, poses: Array, first: NDArray[np.intp]) -> Arr
     if not first.size:
         return np.eye(4)
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_matrix(poses[first, :3, :3]).mean().as_matrix()
+    middle = Rotation.from_matrix(poses[first, :3, :3]).mean()
+    away = (Rotation.from_matrix(poses[first, :3, :3]) * middle.inv()).as_rotvec()
+    pose[:3, :3] = (Rotation.from_rotvec(np.median(away, axis=0)) * middle).as_matrix()
     pose[:3, 3] = np.median(table.cam_T_grip[first, :3] - table.tcp_shift_m[first], axis=0)
     return pose
 

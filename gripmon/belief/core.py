@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from gripmon.belief import bound as bounds
-from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, flags_of, nothing_told
+from gripmon.belief.doubts import Doubt, Onsets, Table, Told, bits, edges_of, nothing_told
 from gripmon.belief.ends import lie_across, look
 from gripmon.belief.held import follow
 from gripmon.belief.jumps import Jumps
@@ -116,7 +116,7 @@ class Belief:
         self._of_ends = int(np.bitwise_or.reduce(self._table.ends))
         self._weighed = np.zeros(1, bool)  # of each hypothesis: it sees no end, and a knock since is weighed beside it
         self._dropped, self._mean = 0.0, np.zeros(SIZE)
-        rows = 2 * np.arange(self._edges + 1)
+        rows = np.arange(2 * self._edges + 1)
         self._rare = 0.5 * (stats.chi2.isf(max(self.priors.unseen_knock, 1e-300), np.maximum(rows, 1)) - rows)
         self._shaken = np.zeros((0, SIZE))  # the noise that g got before this frame where the mount is loose
 
@@ -266,8 +266,7 @@ class Belief:
         i = self._hypotheses
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
-            own = asked.seen.shown & ~flags_of(edges_of(int(bank.doubts[h]), self._table.edges), self._edges)
-            struck = not asked.first and float(candidates.surprise[h]) > self._rare[int(own.sum())]
+            struck = not asked.first and float(candidates.surprise[h]) > self._rare[int(candidates.own[h])]
             for j in range(len(jumps.share)):
                 per_s = self.priors.shakes_per_s if j == 0 and self._is_loose(h) else jumps.per_s[j]
                 chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-per_s * dt_s))

@@ -31,10 +31,11 @@ class Rates:
     leaves_per_background: float = 0.0
 
 
-# Policy, from design: one edge in a hundred is mistaken at first; something is held or lies beside the fingers every
-# 50 s, for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11 days; the mount is loose
-# (it vibrates, flexes, creeps) as often, and as long, as something is held.
+# Policy, from design: one edge in a hundred is mistaken at first, a curve with all its parts; something is held or lies
+# beside the fingers every 50 s, for 5 s; ends are hidden at the start by whatever is held; a finger is bent once in 11
+# days; the mount is loose (it vibrates, flexes, creeps) as often, and as long, as something is held.
 EDGE = Rates(1e-2, 1e-3, 5e-3, 0.0, 0.7)
+CURVE = Rates(1e-2, 1e-3, leaves_per_s=0.2)
 GROUP = Rates(1e-2, 0.02, leaves_per_s=0.2)
 ALL_ENDS = Rates(1e-1, 0.02, leaves_per_s=0.2)
 FINGER = Rates(1e-3, 1e-6)
@@ -158,10 +159,11 @@ class Onsets:
 
 class Told(NamedTuple):
     """What the fingers' ends show at each of the k places where they were looked at: log likelihood of each finger's
-    answer where its ends are there, ``right`` (k, f), and where something else is, ``wrong`` (k, f); ``memory`` (k,):
+    answer where its ends are there, ``right`` (k, f), and where something else is, ``wrong`` (k, f); ``memory`` (k, f):
     probability that an answer is only one of those before again, ``repeats`` (k, f), the share of these that are the
-    same.  ``together`` (k, 2): log likelihood of all fingers' answers where all are right, and all wrong, NaN where
-    these are independent: what lies over all ends answers for all; ``repeats_together`` (k,), their share.  ``rows``
+    same.  Who isn't asked has 0, 0, 1, 1.  ``together`` (k, 2): log likelihood of all fingers' answers where all are
+    right, and all wrong, NaN where these are independent: what lies over all ends answers for all; ``memory_together``
+    and ``repeats_together`` (k,), theirs.  ``rows``
     (e, 23): px by which the middle of each edge at an end moves with g; ``at`` (k, 23): g where it was looked; ``fit``:
     at which of these places the image was fitted.
     """
@@ -171,6 +173,7 @@ class Told(NamedTuple):
     memory: Array
     repeats: Array
     together: Array
+    memory_together: Array
     repeats_together: Array
     rows: Array
     at: Array
@@ -180,7 +183,7 @@ class Told(NamedTuple):
 def nothing_told(edges: int, fingers: int) -> Told:
     """No witness."""
     none, rows, at = np.zeros((0, fingers)), np.zeros((edges, SIZE)), np.zeros((0, SIZE))
-    return Told(none, none, np.zeros(0), none, np.zeros((0, 2)), np.zeros(0), rows, at, 0)
+    return Told(none, none, none, none, np.zeros((0, 2)), np.zeros(0), np.zeros(0), rows, at, 0)
 
 
 @compiled
@@ -220,13 +223,13 @@ def log_told(before: int, after: int, table: Table, told: Told, first: bool, loo
             right = right and here
             rights, sames = rights + int(right), sames + int(same)
             log = told.right[k, f] if right else told.wrong[k, f]
-            apart += answered(log, same, told.repeats[k, f], told.memory[k])
-            wrong += answered(told.wrong[k, f], not first, told.repeats[k, f], told.memory[k])
+            apart += answered(log, same, told.repeats[k, f], told.memory[k, f])
+            wrong += answered(told.wrong[k, f], not first, told.repeats[k, f], told.memory[k, f])
         if not math.isnan(told.together[k, 0]):
-            wrong = answered(told.together[k, 1], not first, told.repeats_together[k], told.memory[k])
+            wrong = answered(told.together[k, 1], not first, told.repeats_together[k], told.memory_together[k])
             if rights in (0, fingers) and sames in (0, fingers):
                 log = told.together[k, 0] if rights else told.together[k, 1]
-                apart = answered(log, sames > 0, told.repeats_together[k], told.memory[k])
+                apart = answered(log, sames > 0, told.repeats_together[k], told.memory_together[k])
         total += apart - wrong
     return total
 
@@ -242,8 +245,3 @@ def answered(log: float, same: bool, repeats: float, memory: float) -> float:
 def bits(flags: Sequence[bool] | Flags) -> int:
     """A bit for each flag, the first the lowest."""
     return int(sum(1 << int(k) for k in np.flatnonzero(np.asarray(flags))))
-
-
-def flags_of(of: int, count: int) -> Flags:
-    """(count,) whether each bit is set."""
-    return np.array([bool((of >> k) & 1) for k in range(count)])

@@ -67,11 +67,11 @@ def lie_across(nodes: Nodes, i: int, bank: Bank, seen: Seen, table: Table, sizes
 @compiled
 def look(nodes: Nodes, i: int, bank: Bank, told: Told, table: Table) -> None:
     """Where the witnesses looked at this node's ends: at the nearest place, if that is within what an end's probes
-    cover, or where the fit is, if the node doesn't know its place so well.
+    cover, or where the fit is, if the node doesn't know its place so well, or nothing tells how far that is.
     """
     mean = bank.mean[nodes.parent[i]]
     for finger in range(len(table.ends)):
-        ends, wide, least = 0, 0.0, LOOKED_PX
+        ends, wide, scale, least = 0, 0.0, 0.0, LOOKED_PX
         for k in range(len(table.edges)):
             if (table.ends[finger] >> k) & 1 and not (table.all_ends >> k) & 1:
                 ends |= table.edges[k]
@@ -84,8 +84,9 @@ def look(nodes: Nodes, i: int, bank: Bank, told: Told, table: Table) -> None:
                 away = 0.0
                 for j in range(SIZE):
                     away += told.rows[edge, j] * (mean[j] - told.at[place, j])
+                    scale += abs(told.rows[edge, j])
                 most = max(most, abs(away))
-            if most <= least:
+            if scale > 0.0 and most < least:
                 nodes.looked[i, finger], least = place, most
         for edge in range(len(told.rows)):
             square = 0.0
@@ -95,7 +96,7 @@ def look(nodes: Nodes, i: int, bank: Bank, told: Told, table: Table) -> None:
                     along += nodes.root[i, k, j] * told.rows[edge, k]
                 square += along * along
             wide = max(wide, square)
-        if wide > LOOKED_PX**2 and len(told.at):
+        if (wide > LOOKED_PX**2 or scale == 0.0) and len(told.at):
             nodes.looked[i, finger] = told.fit
 
 

@@ -243,28 +243,28 @@ def add_row(information: Array, pull: Array, white: Array, zeta: float, sign: fl
 @compiled
 def weigh(
     nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, added: float, near: float, root: Array, solution: Array
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float, int]:  # fmt: skip
     """Log p(frame) of node ``i`` with edges ``doubted`` (bits), of which ``held`` move with the gripper and others may
-    lie ``near`` (a variance, px^2); and the surprise: by how much the squares of its own rows exceed what is expected,
-    halved.  ``added``: what is known of edges that are held, over what each says.  ``root`` (23, 23) of M and
-    ``solution`` (23,) M^-1 b are left behind.
+    lie ``near`` (a variance, px^2); the surprise, by how much the squares of its own rows exceed what is expected,
+    halved; and how many rows these are.  ``added``: what is known of edges that are held, over what each says.
+    ``root`` (23, 23) of M and ``solution`` (23,) M^-1 b are left behind.
     """
-    log, surprise = sum_of(nodes, i, seen, doubted, held, 0, near, root, solution)
+    log, surprise, own = sum_of(nodes, i, seen, doubted, held, 0, near, root, solution)
     log += added
     following = nodes.follows[i] & held
     if following:
         other_root, other = np.empty((SIZE, SIZE)), np.empty(SIZE)
-        following_log, following_surprise = sum_of(nodes, i, seen, doubted, held, following, near, other_root, other)
-        if following_log > log:
+        goes = sum_of(nodes, i, seen, doubted, held, following, near, other_root, other)
+        if goes[0] > log:
             root[:, :], solution[:] = other_root, other
-            return following_log, following_surprise
-    return log, surprise
+            return goes
+    return log, surprise, own
 
 
 @compiled
 def sum_of(
     nodes: Nodes, i: int, seen: Seen, doubted: int, held: int, following: int, near: float, root: Array, solution: Array
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float, int]:  # fmt: skip
     """:func:`weigh`, where what is held goes where the gripper goes on edges ``following`` (bits), or stays."""
     information, pull = np.empty((SIZE, SIZE)), np.empty(SIZE)
     for j in range(SIZE):
@@ -305,7 +305,7 @@ def sum_of(
         total += log_sum(far, beside(nodes, i, seen, doubted, near, information, pull) + half - 0.5 * explained)
     backward(root, solution)
     squares -= explained
-    return total - 0.5 * squares - half, 0.5 * (squares - own)
+    return total - 0.5 * squares - half, 0.5 * (squares - own), own
 
 
 @compiled

@@ -27,20 +27,22 @@ IMPOSSIBLE = -1e5
 
 class Candidates(NamedTuple):
     """c sets: ``node`` (c,), ``doubts`` (c,) as bits, ``log_weight`` (c,) after the frame, not normalised, ``surprise``
-    (c,); ``expanded`` (c,): its neighbours were weighed.
+    (c,) of ``own`` (c,) rows; ``expanded`` (c,): its neighbours were weighed.
     """
 
     node: Ints
     doubts: Ints
     log_weight: Array
     surprise: Array
+    own: Ints
     expanded: Flags
 
     @classmethod
     def empty(cls, sets: int) -> Candidates:
         """Zeros."""
         return cls(
-            np.zeros(sets, np.int64), np.zeros(sets, np.int64), np.zeros(sets), np.zeros(sets), np.zeros(sets, bool)
+            np.zeros(sets, np.int64), np.zeros(sets, np.int64), np.zeros(sets), np.zeros(sets),
+            np.zeros(sets, np.int64), np.zeros(sets, bool),
         )
 
 
@@ -74,13 +76,13 @@ def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank:
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     table, before = asked.table, bank.doubts[nodes.parent[i]]
     doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-    log, surprise = weigh(
+    log, surprise, own = weigh(
         nodes, i, asked.seen, doubted, held, across(nodes, i, doubts), asked.near, root, solution
     )  # fmt: skip
     log += nodes.before[i] + log_transition(before, doubts, asked.chances)
     candidates.node[n], candidates.doubts[n] = i, doubts
     candidates.log_weight[n] = log + log_told(before, doubts, table, asked.told, asked.first, nodes.looked[i])
-    candidates.surprise[n], candidates.expanded[n] = surprise, False
+    candidates.surprise[n], candidates.own[n], candidates.expanded[n] = surprise, own, False
     return n + 1
 
 
@@ -126,7 +128,7 @@ def neighbours(candidates: Candidates, n: int, c: int, nodes: Nodes, bank: Bank,
     before = bank.doubts[nodes.parent[i]]
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     covered, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
-    log, _ = weigh(nodes, i, seen, covered, held, across(nodes, i, doubts), asked.near, root, solution)
+    log, _, _ = weigh(nodes, i, seen, covered, held, across(nodes, i, doubts), asked.near, root, solution)
     candidates.expanded[c] = True
     for k in range(len(table.edges)):
         changed = doubts ^ (1 << k)

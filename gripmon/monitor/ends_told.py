@@ -30,31 +30,40 @@ BOTH_WRONG = np.array([[290.0, 15.5, 3.0], [15.5, 17.0, 11.5], [3.0, 11.5, 13.0]
 HEARD_S = 1.3
 """Time constant with which an answer is forgotten: one in 20 is news at 15 frames/s."""
 FORGOTTEN = 0.05
-"""Weight of all answers at a place, in the last one's, under which it is forgotten."""
+"""Weight of all answers at a place, in the last one's, under which it is forgotten: then a new one is news by 95 %."""
+OPENING_M = 1e-3
+"""Change of the opening from which ends are asked anew: other things are beside them."""
+
+
+@dataclass
+class _Heard:
+    """Answers to one question, each by how long ago it was."""
+
+    weight: dict[tuple[int, ...], float] = field(default_factory=dict)
+
+    @property
+    def all(self) -> float:
+        return sum(self.weight.values())
+
+    def fade(self, kept: float) -> None:
+        self.weight = {answer: kept * weight for answer, weight in self.weight.items()}
+
+    def of(self, answer: tuple[int, ...]) -> tuple[float, float]:
+        """How probable it is that it is one of those before again, and the share of these that are the same."""
+        return self.all / (self.all + 1.0), self.weight.get(answer, 0.0) / max(self.all, 1e-300)
+
+    def hear(self, answer: tuple[int, ...]) -> None:
+        self.weight[answer] = self.weight.get(answer, 0.0) + 1.0
 
 
 @dataclass
 class _Place:
-    """Where ends were asked, and the answers there, each by how long ago it was: of each finger and of all together."""
+    """Where ends were asked, at which opening, and what was heard there of each finger, and of all together."""
 
     cam_T_grip: Array
-    of: list[dict[int, float]]
-    together: dict[tuple[int, ...], float] = field(default_factory=dict)
-
-    def fade(self, kept: float) -> None:
-        """All of them, to so much of their weight."""
-        self.of = [{answer: kept * weight for answer, weight in counts.items()} for counts in self.of]
-        self.together = {answer: kept * weight for answer, weight in self.together.items()}
-
-    def hear(self, answer: tuple[int, ...]) -> None:
-        """One more."""
-        self.together[answer] = self.together.get(answer, 0.0) + 1.0
-        for counts, a in zip(self.of, answer, strict=True):
-            counts[a] = counts.get(a, 0.0) + 1.0
-
-    @property
-    def heard(self) -> float:
-        return sum(self.together.values())
+    opening_m: float
+    of: list[_Heard]
+    together: _Heard = field(default_factory=_Heard)
 
 
 class EndsTold:
@@ -75,30 +84,38 @@ class EndsTold:
         kept = 1.0 if self._last_s is None else math.exp(-(now_s - self._last_s) / HEARD_S)
         self._last_s = now_s
         for place in self._places:
-            place.fade(kept)
-        self._places = [place for place in self._places if place.heard > FORGOTTEN]
-        right, wrong, repeats = np.zeros((3, len(looks), self._fingers))
-        together, (memory, repeats_together) = np.full((len(looks), 2), np.nan), np.zeros((2, len(looks)))
+            for heard in (*place.of, place.together):
+                heard.fade(kept)
+        self._places = [p for p in self._places if any(heard.all > FORGOTTEN for heard in p.of)]
+        shape = (2, len(looks), self._fingers)
+        (right, wrong), (memory, repeats) = np.zeros(shape), np.ones(shape)
+        together, (memory_together, repeats_together) = np.full((len(looks), 2), np.nan), np.zeros((2, len(looks)))
+        heard_now: list[tuple[_Heard, tuple[int, ...]]] = []
         for k, (seen, look) in enumerate(zip(ends, looks, strict=True)):
-            answer = np.where(seen.might > 0, np.minimum(seen.seen, 2), -1)
+            answer, place = np.where(seen.might > 0, np.minimum(seen.seen, 2), -1), self._place(look)
             asked = np.flatnonzero(answer >= 0)
             tables = (LONE_RIGHT, LONE_WRONG) if len(asked) == 1 else (RIGHT, WRONG)
-            right[k], wrong[k] = (np.where(answer >= 0, np.log(of[answer]), 0.0) for of in tables)
+            for f in asked.tolist():
+                right[k, f], wrong[k, f] = (math.log(of[answer[f]]) for of in tables)
+                memory[k, f], repeats[k, f] = place.of[f].of((int(answer[f]),))
+                heard_now.append((place.of[f], (int(answer[f]),)))
             if len(asked) == len(answer) == 2:
                 together[k] = np.log([of[answer[0], answer[1]] for of in (BOTH_RIGHT, BOTH_WRONG)])
-            place, given = self._place(look), tuple(answer.tolist())
-            heard = place.heard
-            memory[k] = heard / (heard + 1.0)
-            if heard > 0.0:
-                repeats[k] = [counts.get(a, 0.0) / heard for counts, a in zip(place.of, given, strict=True)]
-                repeats_together[k] = place.together.get(given, 0.0) / heard
-            place.hear(given)
-        return Told(right, wrong, memory, repeats, together, repeats_together, rows, at, fit)
+                memory_together[k], repeats_together[k] = place.together.of(tuple(answer.tolist()))
+                heard_now.append((place.together, tuple(answer.tolist())))
+        for heard, of_it in heard_now:
+            heard.hear(of_it)
+        return Told(right, wrong, memory, repeats, together, memory_together, repeats_together, rows, at, fit)
 
     def _place(self, look: Measurement) -> _Place:
-        cam_T_grip = look.prediction.cam_T_grip
-        for place in self._places:
-            if look.prediction.moved_px(perturbation_between(cam_T_grip, place.cam_T_grip)) < LOOKED_PX:
-                return place
-        self._places.append(_Place(cam_T_grip, [{} for _ in range(self._fingers)]))
+        """The nearest that is near enough, of those at this opening."""
+        there = look.prediction
+        off_px = [
+            there.moved_px(perturbation_between(there.cam_T_grip, place.cam_T_grip))
+            if abs(there.jaw_opening_m - place.opening_m) < OPENING_M else math.inf
+            for place in self._places
+        ]  # fmt: skip
+        if off_px and min(off_px) < LOOKED_PX:
+            return self._places[int(np.argmin(off_px))]
+        self._places.append(_Place(there.cam_T_grip, there.jaw_opening_m, [_Heard() for _ in range(self._fingers)]))
         return self._places[-1]

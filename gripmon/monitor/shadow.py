@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from gripmon.belief.core import Belief, Believed
-from gripmon.belief.doubts import FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
+from gripmon.belief.doubts import CURVE, FINGER, GROUP, Doubt, Told, of_edges, of_ends, of_mount
 from gripmon.belief.ends import LOOKED_PX
 from gripmon.belief.state import FOCAL, LENGTHS, MOTION, OPENING, REFERENCE, SIZE, Flags, Ints, Priors, Seen
 from gripmon.model.camera import Camera
@@ -106,7 +106,7 @@ class Shadow:
         if not self._gripper.has_jaw or self._jaw_sigma_m == 0.0:
             return 0.0
         if frame.jaw_opening_m is None or before is None:
-            return JAW_UNREPORTED_SIGMA_M if frame.jaw_opening_m is None else 0.0
+            return JAW_UNREPORTED_SIGMA_M  # what was learnt is of the other kind
         kept = math.exp(-abs(frame.jaw_opening_m - before) / (2.0 * self._jaw_sigma_m))
         return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
 
@@ -215,7 +215,8 @@ def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags], edge: Ints) 
     out = [*of_edges(count, fingers), *of_ends(ends_of), of_mount(count, fingers)]
     inner = inner_edges(gripper)
     nobody = np.zeros(fingers, bool)
-    groups = [(inner & along, GROUP), (inner, GROUP), *((side, GROUP) for side in sides(gripper))]
+    groups = [(np.arange(len(inner)) == e, CURVE) for e in np.flatnonzero(gripper.edge_curved)]
+    groups += [(inner & along, GROUP), (inner, GROUP), *((side, GROUP) for side in sides(gripper))]
     if fingers > 1:
         groups += [(gripper.edge_finger == f, FINGER) for f in range(fingers)]
     taken = {d.edges.tobytes() for d in out[:count]}

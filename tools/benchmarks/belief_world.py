@@ -317,4 +317,5 @@ class World:
             self._answered[f], repeats[f] = state, not first and before == self._answer[f]
         right, wrong = (np.log(of[self._answer])[None] for of in (RIGHT, WRONG))
         none, rows = np.full((1, 2), np.nan), self.view.rows[:, 0]
-        return Told(right, wrong, np.array([MEMORY]), 1.0 * repeats[None], none, np.zeros(1), rows, self._g[None], 0)
+        memory, zero = np.full((1, 2), MEMORY), np.zeros(1)
+        return Told(right, wrong, memory, 1.0 * repeats[None], none, zero, zero, rows, self._g[None], 0)
