@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import re
 
 import cv2
@@ -18,6 +19,7 @@ from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
 from gripmon.analyse.page import page
 from gripmon.analyse.pictures import cut_alike
+from gripmon.analyse.plots import Figure
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -510,3 +512,14 @@ def test_what_is_not_used_is_not_shown_in_green():
         blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
         green.append(int((middle - np.maximum(blue, red) > 60).sum()))
     assert green[0] > 200 and green[1] == 0
+
+
+def test_times_in_the_first_seconds_of_1970_are_no_years():
+    """Images without capture times are counted from there; Plotly takes 1000 for the year."""
+    for seconds, expected in ((1.0, "1970-01-01T00:00:01.000000000"), (1_790_000_000.0, 1_790_000_000_000.0)):
+        figure = Figure(300, (("y", 1.0),))
+        figure.add(1, np.array([1e3 * seconds, np.nan]), [0.0, 1.0], "line")
+        figure.mark(round(1e9 * seconds), 1, "mark", "#000000", "dash")
+        drawn = json.loads(figure.json())
+        assert drawn["data"][0]["x"] == [expected, None]
+        assert drawn["layout"]["shapes"][0]["x0"] == drawn["layout"]["annotations"][0]["x"] == expected

@@ -29,6 +29,7 @@ NAMES = {
 }  # fmt: skip
 """Of verdicts, states, affected times and severities; others have :data:`IDLE`."""
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+_YEARS = 1e5  # of at most four digits, and a sign
 _CLEAR, _GRID = "rgba(0,0,0,0)", "rgba(128,128,128,0.18)"
 _TOP_PX, _BOTTOM_PX, _STRIP_PX = 52, 44, 15
 _DRIFT = (
@@ -120,7 +121,13 @@ class Figure:
 
     def json(self) -> str:
         """For a script element, escaped so that no text in it can end the element."""
-        text = msgspec.json.encode({"data": self.data, "layout": self.layout}, enc_hook=_numbers).decode()
+        data, layout = self.data, self.layout
+        if layout["xaxis"].get("type") == "date":
+            data = [trace | {"x": [_date(x) for x in trace["x"]]} for trace in data]
+            for name in ("shapes", "annotations"):
+                marks = [{k: _date(v) if k in ("x", "x0", "x1") else v for k, v in m.items()} for m in layout[name]]
+                layout = layout | {name: marks}
+        text = msgspec.json.encode({"data": data, "layout": layout}, enc_hook=_numbers).decode()
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -252,6 +259,17 @@ def _band(x: Array, low: Array, high: Array) -> tuple[Array, Array]:
 def _times(stamps_ns: Sequence[int]) -> Array:
     """Milliseconds, as a date axis counts them."""
     return 1e-6 * np.array(stamps_ns, np.float64)
+
+
+def _date(time_ms: float | None) -> float | str | None:
+    """A time as it is, but in words where Plotly would take the number for a year: in the first seconds of 1970, when
+    images without capture times are counted from.
+    """
+    if time_ms is None or math.isnan(time_ms):
+        return None
+    if abs(time_ms) >= _YEARS:
+        return round(float(time_ms), 6)
+    return str(np.datetime64(round(1e6 * time_ms), "ns"))
 
 
 def _numbers(values: Any) -> list[float]:
