@@ -318,7 +318,7 @@ def test_four_numbers_are_no_tangential_terms_when_they_are_too_large():
 def test_a_fisheye_that_is_called_plumb_bob_is_asked_for():
     message = {**ECHO, "width": 848, "height": 800, "k": [285.6, 0, 424.6, 0, 286.7, 408.2, 0, 0, 1],
                "d": [-0.0022, 0.0376, -0.0364, 0.0059, 0.0]}  # fmt: skip
-    with pytest.raises(InterchangeError, match=r"p1 = -0.0364 and p2 = 0.0059 are above 0.01.*--model fisheye"):
+    with pytest.raises(InterchangeError, match=r"p1 = -0.0364, p2 = 0.0059: more than 0.01;.*--model fisheye"):
         read_camera(json.dumps(message).encode(), "x")
     found = read_camera(json.dumps(message).encode(), "x", model="fisheye").camera
     assert isinstance(found, FisheyeLens) and found.coefficients == (-0.0022, 0.0376, -0.0364, 0.0059)
@@ -398,3 +398,11 @@ def test_every_command_takes_the_file_as_it_is(tmp_path: Path, capsys: pytest.Ca
     options = ("--size", "640x480", "--model", "brown_conrady", "--out", str(tmp_path / "four.yaml"))
     assert main(["calibrate", "import", str(tmp_path / "four.yml"), *options]) == 0
     assert msgspec.to_builtins(camera_in(tmp_path / "four.yaml").lens)["coefficients"] == (-0.03, 0.005, 1e-3, 0.0)
+
+
+def test_a_lens_with_more_coefficients_than_a_fisheye_has_comes_back_as_it_went_out():
+    """Of a camera that leans: p2 is above what a fisheye's fourth coefficient is asked for from."""
+    message = {**ECHO, "width": 1280, "height": 720, "k": [900.0, 0, 660.0, 0, 900.0, 389.0, 0, 0, 1],
+               "d": [-0.05, 0.03, 0.0040371, 0.011349, -0.02]}  # fmt: skip
+    lens = read_camera(json.dumps(message).encode(), "x").camera
+    assert lens.coefficients[2:4] == (0.0040371, 0.011349)

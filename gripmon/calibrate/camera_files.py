@@ -97,8 +97,9 @@ def _doubts(file: str, lens: FileLens) -> tuple[str, ...]:
     if lens.doubt:
         raise InterchangeError(file, "", lens.doubt, _ASKED)
     tangential = lens.coefficients[2:4]
-    if max(map(abs, tangential), default=0.0) > LARGEST_TANGENTIAL:
-        wrong = "p1 = {:g} and p2 = {:g} are above {:g}: the third and fourth coefficient of a fisheye?"
+    only_four = not any(lens.coefficients[4:])  # a fisheye has no more
+    if only_four and max(map(abs, tangential), default=0.0) > LARGEST_TANGENTIAL:
+        wrong = "p1 = {:g}, p2 = {:g}: more than {:g}; the third and fourth coefficient of a fisheye?"
         raise InterchangeError(file, "", wrong.format(*tangential, LARGEST_TANGENTIAL), _ASKED)
     if lens.fisheye is None and len(lens.coefficients) == 4 and any(lens.coefficients):
         return ("four coefficients are read as k1 k2 p1 p2, but the file doesn't say so: cv2.fisheye also writes four",)
