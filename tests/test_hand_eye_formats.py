@@ -227,3 +227,56 @@ def test_a_flange_behind_the_camera_is_imported_and_completed_by_hand(tmp_path: 
     assert out.read_text() != text and main(["calibrate", "verify", str(out), str(out)]) == 0
     assert main(["calibrate", "import", str(path), "--model", "fisheye", "--out", str(tmp_path / "x.yaml")]) == 2
     assert "is a hand/eye transform (easy_handeye2)" in capsys.readouterr().err
+
+
+def joint(parent: str, child: str, xyz: str, rpy: str = "0 0 0", more: str = "") -> str:
+    return (
+        f'<joint name="{parent}-{child}" type="fixed"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
+    )
+
+
+def urdf(*joints: str) -> bytes:
+    return f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{"".join(joints)}</robot>'.encode()
+
+
+OPTICAL = "-1.5707963267948966 0 -1.5707963267948966"
+MOUNT = joint("tool0", "camera_link", "0.05 0 -0.1", "0 -1.5707963267948966 0")
+COLOR = joint("camera_link", "camera_color_frame", "0 0.015 0")
+LENS = joint("camera_color_frame", "camera_color_optical_frame", "0 0 0", OPTICAL)
+DEPTH = joint("camera_link", "camera_depth_optical_frame", "0 0 0", OPTICAL)
+ARM = joint("wrist_3_link", "flange", "0 0 0") + joint("flange", "tool0", "0 0 0") + joint("tool0", "finger", "0 0 0.1")
+
+
+@pytest.mark.parametrize("which", [None, "camera_color_optical_frame"])
+def test_the_fixed_joints_of_a_camera_are_joined_up_to_its_mount(which: str | None):
+    found = read_hand_eye(urdf(ARM, MOUNT, LENS, COLOR), "x", which=which)
+    assert found is not None and (found.gripper_frame, found.camera_frame) == FRAMES
+    # camera_link's x is tool0's z, its y tool0's y; the optical axes are right, down, forward.
+    expected = np.array([[0.0, 1, 0, 0.05], [-1, 0, 0, 0.015], [0, 0, 1, -0.1], [0, 0, 0, 1]])
+    np.testing.assert_allclose(found.grip_T_cam, expected, rtol=0.0, atol=1e-12)
+
+
+def test_joints_that_lead_to_no_gripper_are_refused_and_only_ends_are_named():
+    with pytest.raises(InterchangeError, match="both of them a camera's by their names; also how the camera is mount"):
+        read_hand_eye(urdf(COLOR, LENS), "x", which="camera_color_optical_frame")
+    several = urdf(MOUNT, COLOR, LENS, DEPTH)
+    for which, wrong in ((None, "holds 4 transforms"), ("thing", "holds no frame thing")):
+        with pytest.raises(InterchangeError) as refused:
+            read_hand_eye(several, "x", which=which)
+        right = "gripmon calibrate import with --camera camera_color_optical_frame or camera_depth_optical_frame"
+        assert str(refused.value) == f"x: {wrong}; {right}"
+    with pytest.raises(InterchangeError, match="camera_link, whose x points along the gripper"):
+        read_hand_eye(several, "x", which="camera_link")
+    with pytest.raises(InterchangeError, match="holds 2 transforms that lead to camera_link; one parent"):
+        read_hand_eye(urdf(MOUNT, joint("flange", "camera_link", "0 0 0"), COLOR, LENS), "x")
+
+
+def test_what_xacro_would_put_in_matters_in_the_camera_s_joints_only():
+    other = joint("a", "b", "${x} 0 0")
+    assert read_hand_eye(urdf(other, MOUNT, COLOR, LENS), "x") is not None
+    with pytest.raises(InterchangeError, match="joint camera_link-camera_color_frame: xyz"):
+        read_hand_eye(urdf(MOUNT, COLOR.replace("0.015", "${y}"), LENS), "x")
+    inserted = joint("tool0", "camera_link", "", "", '<xacro:insert_block name="origin"/>')
+    with pytest.raises(InterchangeError, match="holds parts of xacro; the URDF that xacro makes of it"):
+        read_hand_eye(urdf(inserted, COLOR, LENS), "x")

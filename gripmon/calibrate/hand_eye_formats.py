@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
 from typing import Any
 from xml.etree import ElementTree
 
@@ -51,13 +52,7 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
     found = list(_transforms(document))
     if not found:
         return None
-    chosen = [one for one in found if which in one.frames] if which else found
-    if which is None and len(found) > 1:
-        chosen = [one for one in found if any(map(_CAMERA.search, one.frames))] or found
-    if len(chosen) != 1:
-        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in chosen or found)}"
-        raise InterchangeError(file, "", f"holds {len(found)} transforms", right)
-    hand_eye = _turned(file, chosen[0], which)
+    hand_eye = _turned(file, _joined(file, _chosen(file, found, which), found), which)
     if _is_body(invert(hand_eye.grip_T_cam), hand_eye.camera_frame):
         wrong = f"ends in {hand_eye.camera_frame}, whose x points along the gripper: {BODY_AXES}"
         right = f"the pose of its optical frame: ros2 run tf2_ros tf2_echo {hand_eye.gripper_frame} OPTICAL_FRAME"
@@ -67,12 +62,14 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A transform between two frames; ``camera``: which of them is the camera's, if the file says it."""
+    """A transform between two frames, which is read when it is asked for: a file may hold others that can't be read.
+    ``camera``: which of them is the camera's, if the file says it.
+    """
 
     kind: str
     parent: str
     child: str
-    parent_T_child: Array
+    parent_T_child: Callable[[], Array]
     camera: str | None = None
     covariance: tuple[float, ...] | None = None
 
@@ -81,17 +78,62 @@ class _Pair:
         return self.parent, self.child
 
 
+def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
+    """The transform that ends in the camera's frame: the one with that name, or the last one of a camera's frames."""
+    above = {one.parent for one in found if _CAMERA.search(one.child) or not _CAMERA.search(one.parent)}
+    ends = [one for one in found if one.child not in above]
+    likely = (
+        [one for one in ends if _CAMERA.search(one.child)]
+        or [one for one in found if _CAMERA.search(one.parent)]  # the gripper in the camera's frame
+        or ends
+    )
+    chosen = likely
+    if which is not None:
+        chosen = [one for one in found if which == one.child] or [one for one in found if which == one.parent]
+    if len(chosen) != 1:
+        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in likely or found)}"
+        wrong = f"holds {len(found)} transforms" if chosen or which is None else f"holds no frame {which}"
+        raise InterchangeError(file, "", wrong, right)
+    return chosen[0]
+
+
+def _joined(file: str, pair: _Pair, found: Sequence[_Pair]) -> _Pair:
+    """The transform from the first frame above that isn't the camera's own: what lies between is its mount."""
+    chain = [pair]
+    while pair.camera is None and _CAMERA.search(chain[0].parent):
+        above = [one for one in found if one.child == chain[0].parent and one not in chain]
+        if len(above) > 1:
+            wrong = f"holds {len(above)} transforms that lead to {chain[0].parent}"
+            raise InterchangeError(file, "", wrong, "one parent for each frame")
+        if not above:
+            break
+        chain = [*above, *chain]
+    if len(chain) == 1:
+        return pair
+    return replace(pair, parent=chain[0].parent, parent_T_child=lambda: _product(one.parent_T_child() for one in chain))
+
+
+def _product(transforms: Iterable[Array]) -> Array:
+    return reduce(np.matmul, transforms)
+
+
 def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
     """From the gripper to the camera, whichever of both is the parent."""
     said = pair.camera or which
-    cameras = [name == said if said else bool(_CAMERA.search(name)) for name in pair.frames]
+    own = [bool(_CAMERA.search(name)) for name in pair.frames]
+    if pair.camera is None and all(own):
+        wrong = f"leads from {pair.parent} to {pair.child}, both of them a camera's by their names"
+        right = "also how the camera is mounted: transforms from the gripper's frame on"
+        raise InterchangeError(file, "", wrong, right)
+    cameras = [name == said for name in pair.frames] if said else own
     if cameras[0] == cameras[1]:
         right = f"gripmon calibrate import with --camera {pair.child}, or {pair.parent} if that is the camera's"
         raise InterchangeError(file, "", f"leads from {pair.parent} to {pair.child}: which is the camera's?", right)
     gripper, camera = pair.frames[:: -1 if cameras[0] else 1]
     if pair.camera is None and _BASE.match(gripper):
         raise InterchangeError(file, "", f"leads from {gripper} to {camera}", _FIXED)
-    grip_T_cam = invert(pair.parent_T_child) if cameras[0] else pair.parent_T_child
+    parent_T_child = pair.parent_T_child()
+    grip_T_cam = invert(parent_T_child) if cameras[0] else parent_T_child
     return ForeignHandEye(pair.kind, gripper, camera, grip_T_cam, pair.covariance)
 
 
@@ -142,7 +184,7 @@ def _easy_handeye(values: FileValues) -> _Pair:
         shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
         keys = ("x", "y", "z", "w")
     pose = _pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
-    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], pose, frames[1])
+    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], lambda: pose, frames[1])
 
 
 def _own_json(values: FileValues) -> _Pair:
@@ -154,7 +196,7 @@ def _own_json(values: FileValues) -> _Pair:
     # With --gripper-in-camera, the camera's frame is the parent.
     camera, gripper = (parent, child) if np.allclose(np.reshape(matrix, (4, 4)), pose, atol=1e-9) else (child, parent)
     covariance = values.numbers("covariance", (36,), "6 x 6 numbers")
-    return _Pair("json", camera, gripper, pose, camera, covariance)
+    return _Pair("json", camera, gripper, lambda: pose, camera, covariance)
 
 
 def _joints(document: Document) -> Iterator[_Pair]:
@@ -164,14 +206,21 @@ def _joints(document: Document) -> Iterator[_Pair]:
     except (ElementTree.ParseError, ValueError):
         return
     for joint in root.iter("joint"):
-        parent, child, origin = (joint.find(name) for name in ("parent", "child", "origin"))
-        if joint.get("type") != "fixed" or parent is None or child is None:
-            continue
-        at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
-        values = FileValues(document.file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
-        shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
-        pose = make_transform(_from_angles(*turn), np.array(shift))
-        yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+        parent, child = (joint.find(name) for name in ("parent", "child"))
+        if joint.get("type") == "fixed" and parent is not None and child is not None:
+            pose = partial(_joint, document.file, joint)
+            yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+
+
+def _joint(file: str, joint: ElementTree.Element) -> Array:
+    """A joint's transform (4, 4); xacro may insert an origin that isn't in the text."""
+    origin = joint.find("origin")
+    at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
+    values = FileValues(file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
+    if any("}" in part.tag for part in joint):
+        raise values.fault("", "holds parts of xacro", "the URDF that xacro makes of it")
+    shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
+    return make_transform(_from_angles(*turn), np.array(shift))
 
 
 _COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
@@ -217,12 +266,15 @@ def _command(file: str, kind: str, words: list[str]) -> _Pair:
         content = dict(zip([*keys, "frame-id", "child-frame-id"], words, strict=False))
     values = FileValues(file, content, _PUBLISHED, "static_transform_publisher: ")
     parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
+    return _Pair(kind, parent, child, partial(_published_pose, values))
+
+
+def _published_pose(values: FileValues) -> Array:
     shift = [values.number(key, 0.0) for key in "xyz"]
-    if any(key in content for key in ("roll", "pitch", "yaw")):
+    if any(key in values.content for key in ("roll", "pitch", "yaw")):
         angles = [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]
-        return _Pair(kind, parent, child, make_transform(_from_angles(*angles), np.array(shift)))
-    quaternion = [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"]
-    return _Pair(kind, parent, child, _pose(values, shift, quaternion))
+        return make_transform(_from_angles(*angles), np.array(shift))
+    return _pose(values, shift, [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"])
 
 
 def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
