@@ -122,6 +122,8 @@ FILES = {
     "--child-frame-id camera_color_optical_frame --ros-args -r __node:=a\n",
     "static transform, angles": f"{COMMAND} --x {X} --y {Y} --z {Z} --roll {ROLL} --pitch {PITCH} --yaw {YAW} "
     "--frame-id tool0 --child-frame-id camera_color_optical_frame\n",
+    "static transform, with =": f"{COMMAND} --x={X} --y={Y} --z={Z} --qx={QX} --qy={QY} --qz={QZ} --qw={QW} "
+    "--frame-id=tool0 --child-frame-id=camera_color_optical_frame 2>&1 >/dev/null &  # the wrist\n",
     "static transform, by place": f"{COMMAND} {X} {Y} {Z} {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame\n",
     "static transform, ROS 1's period": "rosrun tf static_transform_publisher "
     f"{X} {Y} {Z} {YAW} {PITCH} {ROLL} tool0 camera_color_optical_frame 100 __name:=a\n",
@@ -190,7 +192,15 @@ REFUSED = [
     (EASY_1.replace("  qw: 0.9", "  qw: 0.7"), "its quaternion has length 0.8"),
     (EASY_1.replace("  z: -0.119\n", ""), "transformation.z: is missing"),
     (EASY_2.replace("y: -0.063", "y: much"), "transform.translation.y: 'much' is not a number"),
-    (FILES["static transform, options"].replace("--child-frame-id", "--other"), "child-frame-id: is missing; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id", "--other"), "'--other' is no option of it; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id", "--frame-id"), "'--frame-id' is there twice; --x"),
+    (FILES["static transform, options"].replace("--x", "--x 0.1 --x"), "'--x' is there twice; --x"),
+    (FILES["static transform, angles"].replace("--yaw", "--Yaw"), "'--Yaw' is no option of it; --x"),
+    (FILES["static transform, angles"].replace("--yaw", "--qz"), "--roll and --qz are two rotations; angles or a quat"),
+    (FILES["static transform, options"].replace("--x 0.012", "0.012"), "'0.012' is no option of it; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id camera_color_optical_frame", ""), "child-frame"),
+    (FILES["static transform, options"].rstrip() + " --x", "'--x' is there twice"),
+    (FILES["static transform, by place"].rstrip() + " 100 0.5", "'0.5' is more than it takes; --x"),
     (FILES["static transform, by place"].replace(FRAMES[1], "thing"), "which is the camera.s.* --camera thing, or"),
     (body("a_cam") + body("b_cam"), "holds 2 transforms; gripmon calibrate import with --camera a_cam or b_cam"),
 ]  # fmt: skip

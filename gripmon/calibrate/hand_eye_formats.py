@@ -6,18 +6,18 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
+from gripmon.calibrate.foreign import Document, FileValues, InterchangeError, shown
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array
 
+_ANGLES, _QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
 READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
 UNIT_TOLERANCE = 0.01
 """Largest difference of a quaternion's length from 1: files of four digits are rounded."""
@@ -179,7 +179,7 @@ def _easy_handeye(values: FileValues) -> _Pair:
         raise values.fault("", f"leads from the robot's base to {frames[1]}", _FIXED)
     if first:
         shift = turn = values.below("transformation")
-        keys = ("qx", "qy", "qz", "qw")
+        keys = _QUATERNION
     else:
         shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
         keys = ("x", "y", "z", "w")
@@ -227,6 +227,8 @@ _COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
 _NODE = re.compile(r"<node\b[^>]*static_transform_publisher[^>]*>")
 _ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
 _ARGS = re.compile(r"""\bargs["']?\s*[=:]\s*(?:"([^"]*)"|'([^']*)'|([^\n]*))""")
+_SHELL = re.compile(r"\s#|\s\d>|[;&|<>]")
+"""Ends a command: a comment, another command, where its output goes."""
 _WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
 
 
@@ -243,38 +245,64 @@ def _published(document: Document) -> Iterator[_Pair]:
             args = _ARGS.search(part)
             line = next((each for each in args.groups() if each is not None), "") if args else part.partition("\n")[0]
             try:
-                words = shlex.split(line)
+                words = shlex.split(line if args else _SHELL.split(line, maxsplit=1)[0])
             except ValueError as error:
                 raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
         yield _command(document.file, kind, words)
 
 
-_PUBLISHED = "--x … --qw … --frame-id PARENT --child-frame-id CHILD, or x y z qx qy qz qw PARENT CHILD"
+_PUBLISHED = (
+    "--x --y --z, --qx … --qw or --roll --pitch --yaw, --frame-id PARENT --child-frame-id CHILD; or "
+    "x y z qx qy qz qw PARENT CHILD"
+)
+
+
+_OPTIONS = ("x", "y", "z", *_QUATERNION, *_ANGLES, "frame-id", "child-frame-id")
 
 
 def _command(file: str, kind: str, words: list[str]) -> _Pair:
     """By options, or by place: x y z, then yaw pitch roll or a quaternion, both frames, and ROS 1's period."""
     words = words[: words.index("--ros-args")] if "--ros-args" in words else words
-    content: Mapping[str, Any]
     if any(word.startswith("--") for word in words):
-        options = zip(words[::2], words[1::2], strict=False)
-        content = {name.lstrip("-").replace("_", "-"): value for name, value in options}
+        content = _by_options(file, words)
     else:
         words = [word for word in words if not word.startswith("__")]
         by_quaternion = len(words) > 8 and not re.match(r"[A-Za-z/_]", words[6])
-        keys = ["x", "y", "z", *(("qx", "qy", "qz", "qw") if by_quaternion else ("yaw", "pitch", "roll"))]
-        content = dict(zip([*keys, "frame-id", "child-frame-id"], words, strict=False))
+        keys = ["x", "y", "z", *(_QUATERNION if by_quaternion else _ANGLES[::-1]), "frame-id", "child-frame-id"]
+        if len(words) > len(keys) + 1:
+            wrong = f"static_transform_publisher: {shown(words[len(keys) + 1])} is more than it takes"
+            raise InterchangeError(file, "", wrong, _PUBLISHED)
+        content = dict(zip(keys, words, strict=False))
     values = FileValues(file, content, _PUBLISHED, "static_transform_publisher: ")
     parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
     return _Pair(kind, parent, child, partial(_published_pose, values))
 
 
+def _by_options(file: str, words: Sequence[str]) -> dict[str, str]:
+    """Each once, as ``--x 0.1`` or ``--x=0.1``; its rotation as angles or as a quaternion."""
+    content: dict[str, str] = {}
+    left = iter(words)
+    for word in left:
+        name, equals, value = word.removeprefix("--").partition("=")
+        wrong = "is no option of it" if not word.startswith("--") or name not in _OPTIONS else ""
+        wrong = wrong or ("is there twice" if name in content else "")
+        content[name] = value if equals else next(left, "")
+        if wrong or not content[name]:
+            wrong = f"static_transform_publisher: {shown(word)} {wrong or 'has no value'}"
+            raise InterchangeError(file, "", wrong, _PUBLISHED)
+    both = [next((name for name in names if name in content), "") for names in (_ANGLES, _QUATERNION)]
+    if all(both):
+        wrong = f"static_transform_publisher: --{both[0]} and --{both[1]} are two rotations"
+        raise InterchangeError(file, "", wrong, "angles or a quaternion")
+    return content
+
+
 def _published_pose(values: FileValues) -> Array:
     shift = [values.number(key, 0.0) for key in "xyz"]
-    if any(key in values.content for key in ("roll", "pitch", "yaw")):
-        angles = [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]
+    if any(key in values.content for key in _ANGLES):
+        angles = [values.number(key, 0.0) for key in _ANGLES]
         return make_transform(_from_angles(*angles), np.array(shift))
-    return _pose(values, shift, [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"])
+    return _pose(values, shift, [values.number(key, float(key == "qw")) for key in _QUATERNION])
 
 
 def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
