@@ -16,6 +16,7 @@ from gripmon.cli import main
 from gripmon.daemon.calibrations import camera_in
 from gripmon.daemon.config.calibrated import read_camera as read_any_camera
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, make_camera
+from gripmon.model.errors import InputError
 
 POINTS_M = np.column_stack(
     [np.random.default_rng(3).uniform(-0.25, 0.25, (100, 2)), np.random.default_rng(4).uniform(0.9, 1.4, 100)]
@@ -362,6 +363,10 @@ REFUSED = [
     (OST.replace("camera matrix\n511.143797", "camera matrix\n"), r"camera matrix: holds 8 values; 3 x 3 numbers"),
     (json.dumps({**ECHO, "d": D, "k": [0.0] * 9}), "k: is all zeros: an uncalibrated camera"),
     (json.dumps({**ECHO, "d": D, "k": K, "roi": {"x_offset": 8, "width": 640, "height": 480}}), "roi: .* isn't part"),
+    (KALIBR.partition("cam1")[0].replace("radtan", "[radtan]"), r"distortion_model: \['radtan'\] is not a model"),
+    (json.dumps({**ECHO, "d": D, "k": K, "distortion_model": {"a": 1}}), "distortion_model: {'a': 1} is not a model"),
+    (json.dumps({**ECHO, "d": D, "k": K}).replace("640", "6" * 5000), "not YAML: Exceeds the limit"),
+    (COLMAP.split("\n")[8].replace("1280", "1" * 5000), "camera 6: width: '11.* is not a number"),
     ("camera_matrix: {rows: 3, cols: 3, data: [1]}\ndistortion_model: equidistant\n", "image_width: is missing"),
 ]  # fmt: skip
 
@@ -398,3 +403,16 @@ def test_every_command_takes_the_file_as_it_is(tmp_path: Path, capsys: pytest.Ca
     options = ("--size", "640x480", "--model", "brown_conrady", "--out", str(tmp_path / "four.yaml"))
     assert main(["calibrate", "import", str(tmp_path / "four.yml"), *options]) == 0
     assert msgspec.to_builtins(camera_in(tmp_path / "four.yaml").lens)["coefficients"] == (-0.03, 0.005, 1e-3, 0.0)
+
+
+def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "cam.yaml"
+    path.write_text(VINS)
+
+    def forbidden(*_args: object, **_kwargs: object) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    for name in ("read_bytes", "read_text"):
+        monkeypatch.setattr(Path, name, forbidden)
+    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); a readable YAML file"):
+        read_any_camera(path)

@@ -202,13 +202,14 @@ _COLMAP: dict[str, tuple[int, int, bool]] = {
 def _colmap(file: str, line: str) -> FileLens:
     """A line of ``cameras.txt``: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]; its first pixel's centre is at 0.5."""
     number, model, width, height, *parameters = line.split()
-    values = FileValues(file, {"parameters": parameters}, "cameras.txt of COLMAP", f"camera {number}: ")
+    content = {"parameters": parameters, "width": width, "height": height}
+    values = FileValues(file, content, "cameras.txt of COLMAP", f"camera {number}: ")
     focals, count, fisheye = values.choice("model", model, _COLMAP)
     right = f"{focals + 2 + count} numbers for {model}"
     found = values.numbers("parameters", (focals + 2 + count,), right)
     centre, lens = found[focals : focals + 2], found[focals + 2 :]
     pinhole = found[0], found[focals - 1], centre[0] - 0.5, centre[1] - 0.5
-    return FileLens(pinhole, lens + (0.0,) * (4 - len(lens)), (int(width), int(height)), fisheye)
+    return FileLens(pinhole, lens + (0.0,) * (4 - len(lens)), values.size("width", "height"), fisheye)
 
 
 _REALSENSE = "intrinsics of librealsense: width, height, fx, fy, ppx, ppy, model, coeffs"
