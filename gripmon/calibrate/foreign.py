@@ -159,7 +159,7 @@ class Document:
     """A file of another program; ``right`` says which may be read."""
 
     def __init__(self, file: str, data: bytes, right: str) -> None:
-        self.file, self.text, self._right = file, text_of(file, data, right), right
+        self.file, self.text, self._right = file, text_of(file, data, right).replace("\r\n", "\n"), right
 
     @functools.cached_property
     def content(self) -> dict[str, Any]:
