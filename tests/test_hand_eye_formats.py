@@ -183,6 +183,26 @@ def test_a_camera_link_is_recognised_by_its_axes_and_named(frame: str):
     assert read_hand_eye(FILES["moveit 1"].replace(FRAMES[1], "camera_link").encode(), "x") is not None
 
 
+def along_x(frame: str, z: float) -> str:
+    """An effector whose x points out of it, and a camera with the same axes 0.1 m behind it."""
+    still = EASY_1.replace(f"qw: {QW}", "qw: 1").replace(f"qx: {QX}", "qx: 0").replace(f"x: {X}", "x: -0.1")
+    return still.replace(f"y: {Y}", "y: 0").replace(f"z: {Z}", f"z: {z}").replace(FRAMES[1], frame)
+
+
+def test_a_camera_link_of_an_effector_with_x_forward_is_recognised_by_its_name_or_doubted(tmp_path: Path, capsys):
+    with pytest.raises(InterchangeError, match="ends in camera_link, whose x points along the gripper"):
+        read_hand_eye(along_x("camera_link", -0.06).encode(), "x")
+    sideways = read_hand_eye(along_x("camera_optical_frame", -0.06).encode(), "x")
+    assert sideways is not None and not sideways.doubt
+    path, out = tmp_path / "theirs.yaml", tmp_path / "reference.yaml"
+    path.write_text(along_x("camera_link", -0.12))
+    assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
+    said = "camera_link may have the axes of a ROS body such as camera_link (x forward, y left, z up) instead"
+    assert f"warning: {said}" in capsys.readouterr().out and f"# {said}" in out.read_text()
+    assert main(["calibrate", "verify", str(path), str(path)]) == 2
+    assert said in capsys.readouterr().err
+
+
 REFUSED = [
     (EASY_1.replace("eye_on_hand: true", "eye_on_hand: false"), "robot's base to camera_color_optical_frame; is a"),
     (EASY_2.replace("eye_in_hand", "eye_on_base"), "is a fixed camera's pose; gripmon calibrate robot-world"),

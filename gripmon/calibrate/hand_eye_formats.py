@@ -32,7 +32,7 @@ _BASE = re.compile(
 @dataclass(frozen=True, slots=True)
 class ForeignHandEye:
     """The camera's pose in the gripper's frame, ``grip_T_cam`` (4, 4), as a file of the format ``kind`` has it, and the
-    covariance (6·6) of ``cam_T_grip`` if it has that.
+    covariance (6·6) of ``cam_T_grip`` if it has that.  ``doubt``: why it may be in other axes than a camera's.
     """
 
     kind: str
@@ -40,6 +40,7 @@ class ForeignHandEye:
     camera_frame: str
     grip_T_cam: Array
     covariance: tuple[float, ...] | None = None
+    doubt: str = ""
 
 
 def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> ForeignHandEye | None:
@@ -53,10 +54,15 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
     if not found:
         return None
     hand_eye = _turned(file, _joined(file, _chosen(file, found, which), found), which)
-    if _is_body(invert(hand_eye.grip_T_cam), hand_eye.camera_frame):
-        wrong = f"ends in {hand_eye.camera_frame}, whose x points along the gripper: {BODY_AXES}"
+    camera = hand_eye.camera_frame
+    body = _body(invert(hand_eye.grip_T_cam), camera)
+    if body:
+        wrong = f"ends in {camera}, whose x points along the gripper: {BODY_AXES}"
         right = f"the pose of its optical frame: ros2 run tf2_ros tf2_echo {hand_eye.gripper_frame} OPTICAL_FRAME"
         raise InterchangeError(file, "", wrong, right)
+    if body is None:
+        doubt = f"{camera} may have {BODY_AXES}; if so, the pose of its optical frame"
+        hand_eye = replace(hand_eye, doubt=doubt)
     return hand_eye
 
 
@@ -137,12 +143,17 @@ def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
     return ForeignHandEye(pair.kind, gripper, camera, grip_T_cam, pair.covariance)
 
 
-def _is_body(cam_T_grip: Array, name: str) -> bool:
-    """Whether the frame's axes are x forward: the gripper points along its x, and lies there or the name isn't an
-    optical frame's.
+def _body(cam_T_grip: Array, name: str) -> bool | None:
+    """Whether the frame's axes are x forward; None where its name says so, but they don't.  A gripper's z points
+    along that x, and its origin lies there; of a frame that is called a body's (``camera_link``) one of both is enough,
+    since an effector's own z may not point out of it.
     """
     out, at = cam_T_grip[:3, 2], cam_T_grip[:3, 3]
-    return bool(out[0] > max(abs(out[1]), abs(out[2])) and ("optical" not in name or lies_along_x(at)))
+    turned, lies = lies_along_x(out), lies_along_x(at)
+    called = "optical" not in name.lower() and re.search(r"_(?:link|frame)$", name.lower()) is not None
+    if (turned and (lies or "optical" not in name.lower())) or (lies and called):
+        return True
+    return None if called else False
 
 
 def lies_along_x(cam_t_tcp: Array) -> bool:

@@ -44,6 +44,8 @@ def import_calibration(
         if hand_eye.covariance is None:
             tcp = f"if the TCP isn't at {hand_eye.gripper_frame} (x across the jaws, z out): flange_T_tcp in this file"
             notes, lines = [*notes, tcp], [*lines, tcp]
+        if hand_eye.doubt:
+            notes, lines = [*notes, hand_eye.doubt], [*lines, f"warning: {hand_eye.doubt}"]
         text = "".join(f"# {note}\n" for note in notes) + as_yaml(reference_values(hand_eye), inline=True)
         return text.encode(), lines
     found = read_foreign_camera(data, str(path), which=which, size_px=size_px, model=model)
