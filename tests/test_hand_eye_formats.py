@@ -310,3 +310,23 @@ def test_what_xacro_would_put_in_matters_in_the_camera_s_joints_only():
     inserted = joint("tool0", "camera_link", "", "", '<xacro:insert_block name="origin"/>')
     with pytest.raises(InterchangeError, match="holds parts of xacro; the URDF that xacro makes of it"):
         read_hand_eye(urdf(inserted, COLOR, LENS), "x")
+
+
+@pytest.mark.parametrize("frame", ["base_link_inertia", "ur5_base_link", "torso_lift_link", "pedestal", "root"])
+def test_a_fixed_camera_is_recognised_by_the_other_frame_and_overruled_by_name(frame: str):
+    text = FILES["static transform, by place"].replace("tool0", frame)
+    right = f"if {frame} moves with the camera: gripmon calibrate import with --camera {FRAMES[1]}"
+    with pytest.raises(InterchangeError, match=f"is a fixed camera's pose; .*; {right}"):
+        read_hand_eye(text.encode(), "x")
+    found = read_hand_eye(text.encode(), "x", which=FRAMES[1])
+    assert found is not None and found.gripper_frame == frame
+    # Where the name had to choose, it says nothing about the other frame.
+    for other in (text + text.replace("color", "depth"), text.replace(FRAMES[1], "thing")):
+        with pytest.raises(InterchangeError, match=r"is a fixed camera's pose; .* a file with this transform alone"):
+            read_hand_eye(other.encode(), "x", which="thing" if "thing" in other else FRAMES[1])
+
+
+@pytest.mark.parametrize("frame", ["robotiq_85_base_link", "wsg50_base_link", "left/gripper_base", "panda_hand"])
+def test_a_gripper_s_own_base_is_none_of_the_robot_s(frame: str):
+    found = read_hand_eye(FILES["static transform, by place"].replace("tool0", frame).encode(), "x")
+    assert found is not None and found.gripper_frame == frame

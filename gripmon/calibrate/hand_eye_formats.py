@@ -25,8 +25,11 @@ BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up
 _FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
 _BASE = re.compile(
-    r"(?!.*(?:grip|hand|tool|flange|tcp))(?:.*[_/])?(?:world|map|odom|base(?:_link|_footprint)?|link_?0|table)$", re.I
+    r"(?!.*(?:grip|hand|tool|flange|tcp|finger|jaw|robotiq|wsg|schunk|onrobot|rg[26]|[23]f[_\d]))(?:.*[_/])?"
+    r"(?:world|map|odom|root|base(?:_link|_footprint)?(?:_inertia)?|link_?0|table|stand|pedestal|torso(?:_lift)?(?:_link)?)$",
+    re.I,
 )
+"""Frames that don't move with a gripper, unless they are called after one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,10 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
     found = list(_transforms(document))
     if not found:
         return None
-    hand_eye = _turned(file, _joined(file, _chosen(file, found, which), found), which)
+    pair = _joined(file, _chosen(file, found, which), found)
+    hand_eye = _turned(file, pair, which)
+    if pair.camera is None and _BASE.match(hand_eye.gripper_frame):
+        _refuse_fixed(file, hand_eye, which, len(_likely(found)) == 1)
     camera = hand_eye.camera_frame
     body = _body(invert(hand_eye.grip_T_cam), camera)
     if body:
@@ -84,21 +90,26 @@ class _Pair:
         return self.parent, self.child
 
 
-def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
-    """The transform that ends in the camera's frame: the one with that name, or the last one of a camera's frames."""
+def _likely(found: Sequence[_Pair]) -> list[_Pair]:
+    """Those that end in a camera's last frame by their names; all ends where no name is a camera's."""
     above = {one.parent for one in found if _CAMERA.search(one.child) or not _CAMERA.search(one.parent)}
     ends = [one for one in found if one.child not in above]
-    likely = (
+    return (
         [one for one in ends if _CAMERA.search(one.child)]
         or [one for one in found if _CAMERA.search(one.parent)]  # the gripper in the camera's frame
         or ends
+        or list(found)
     )
-    chosen = likely
+
+
+def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
+    """The transform that ends in the camera's frame: the one with that name, or the only likely one."""
+    chosen = likely = _likely(found)
     if which is not None:
         chosen = [one for one in found if which == one.child] or [one for one in found if which == one.parent]
     if len(chosen) != 1:
-        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in likely or found)}"
-        wrong = f"holds {len(found)} transforms" if chosen or which is None else f"holds no frame {which}"
+        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in likely)}"
+        wrong = f"holds {len(found)} transforms" if chosen else f"holds no frame {which}"
         raise InterchangeError(file, "", wrong, right)
     return chosen[0]
 
@@ -136,11 +147,22 @@ def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
         right = f"gripmon calibrate import with --camera {pair.child}, or {pair.parent} if that is the camera's"
         raise InterchangeError(file, "", f"leads from {pair.parent} to {pair.child}: which is the camera's?", right)
     gripper, camera = pair.frames[:: -1 if cameras[0] else 1]
-    if pair.camera is None and _BASE.match(gripper):
-        raise InterchangeError(file, "", f"leads from {gripper} to {camera}", _FIXED)
     parent_T_child = pair.parent_T_child()
     grip_T_cam = invert(parent_T_child) if cameras[0] else parent_T_child
     return ForeignHandEye(pair.kind, gripper, camera, grip_T_cam, pair.covariance)
+
+
+def _refuse_fixed(file: str, hand_eye: ForeignHandEye, which: str | None, alone: bool) -> None:
+    """Unless ``which`` repeats what the file says: where it had to choose, it says nothing about the other frame."""
+    gripper, camera = hand_eye.gripper_frame, hand_eye.camera_frame
+    if not (alone and _CAMERA.search(camera)):
+        way_out = "a file with this transform alone, to a frame that is called camera"
+    elif which is None:
+        way_out = f"gripmon calibrate import with --camera {camera}"
+    else:
+        return
+    wrong = f"leads from {gripper} to {camera}"
+    raise InterchangeError(file, "", wrong, f"{_FIXED}; if {gripper} moves with the camera: {way_out}")
 
 
 def _body(cam_T_grip: Array, name: str) -> bool | None:
