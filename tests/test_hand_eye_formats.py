@@ -135,6 +135,20 @@ FILES = {
 }
 
 
+# A name is no executable.
+OTHERS = '''Node(package="a", executable="b", name="static_transform_publisher_b", arguments=["--x", f(1)]),
+        Node(package="tf2_ros", name="static_transform_publisher_cam (\\")",'''
+FILES["moveit 2, among other nodes"] = MOVEIT_2.replace("Node(\n", OTHERS, 1).replace(
+    "        ),\n", '        ),\n        Node(executable="c", arguments=["static_transform_publisher", "--y"]),\n', 1
+)
+FILES["moveit 1, among other nodes"] = MOVEIT_1.replace(
+    "  <node", '  <node pkg="a" type="b" name="static_transform_publisher_b" args="1 2 3" />\n  <node', 1
+).replace("camera_link_broadcaster", "static_transform_publisher_camera_link_broadcaster")
+FILES["static transform, in YAML with names"] = FILES["static transform, in YAML"].replace(
+    "    pkg", "    name: static_transform_publisher cam\n    pkg"
+).replace("launch:\n", "launch:\n- node: {pkg: a, exec: b, name: static_transform_publisher_b, args: 1 2 3}\n")
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_each_file_gives_the_camera_s_pose_in_the_gripper_s_frame(name: str, tmp_path: Path):
     found = read_hand_eye(FILES[name].encode(), "their.file")

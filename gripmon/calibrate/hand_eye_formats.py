@@ -4,11 +4,13 @@ files, commands of ``static_transform_publisher``, URDF, and gripmon's own JSON.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -185,8 +187,8 @@ def lies_along_x(cam_t_tcp: Array) -> bool:
 
 
 def _transforms(document: Document) -> Iterator[_Pair]:
-    if "static_transform_publisher" in document.text:
-        yield from _published(document)
+    if "static_transform_publisher" in document.text and (published := list(_published(document))):
+        yield from published
         return
     if document.text.lstrip().startswith("<"):
         yield from _joints(document)
@@ -257,9 +259,13 @@ def _joint(file: str, joint: ElementTree.Element) -> Array:
 
 
 _COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
-_NODE = re.compile(r"<node\b[^>]*static_transform_publisher[^>]*>")
+_NODE = re.compile(r"<node\b[^>]*>")
+_CALL = re.compile(r"\bNode\(")
+_MARK = re.compile(r""""(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|#[^\n]*|[()]""")
+_EXECUTABLE = re.compile(r"""\b(?:(?:node_)?exec(?:utable)?|type)\s*=\s*["']static_transform_publisher["']""")
 _ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
-_ARGS = re.compile(r"""\bargs["']?\s*[=:]\s*(?:"([^"]*)"|'([^']*)'|([^\n]*))""")
+_ARGS = re.compile(r"""\bargs\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_LINE = re.compile(r"(?:^|[\s/])static_transform_publisher[ \t]+([^\n]*)", re.MULTILINE)
 _SHELL = re.compile(r"\s#|\s\d>|[;&|<>]")
 """Ends a command: a comment, another command, where its output goes."""
 _WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
@@ -267,29 +273,61 @@ _WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
 
 def _published(document: Document) -> Iterator[_Pair]:
     """``static_transform_publisher`` in a shell's line, or in a launch file (Python, XML, YAML), such as MoveIt's."""
-    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
     kind = "moveit" if "MoveIt" in document.text or "camera_link_broadcaster" in document.text else "static transform"
     if "EYE-TO-HAND" in document.text:
         raise InterchangeError(document.file, "", "says EYE-TO-HAND", _FIXED)
-    for part in _NODE.findall(text) or text.split("static_transform_publisher")[1:]:
-        if python := _ARGUMENTS.search(part):
-            words = [quoted or bare for quoted, bare in _WORD.findall(re.sub(r"#[^\n]*", "", python[1]))]
-        else:
-            args = _ARGS.search(part)
-            line = next((each for each in args.groups() if each is not None), "") if args else part.partition("\n")[0]
-            try:
-                words = shlex.split(line if args else _SHELL.split(line, maxsplit=1)[0])
-            except ValueError as error:
-                raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
+    for command in _commands(document):
+        try:
+            words = shlex.split(command) if isinstance(command, str) else command
+        except ValueError as error:
+            raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
         yield _command(document.file, kind, words)
+
+
+def _commands(document: Document) -> Iterator[str | list[str]]:
+    """The arguments of each node with this executable, whatever its name; or of each line of a shell."""
+    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
+    if text.lstrip().startswith("<"):
+        for node in filter(_EXECUTABLE.search, _NODE.findall(text)):
+            args = _ARGS.search(node)
+            yield "" if args is None else args[1] or args[2] or ""
+    elif _CALL.search(text):
+        for node in filter(_EXECUTABLE.search, _calls(text)):
+            listed = _ARGUMENTS.search(node)
+            inside = "" if listed is None else re.sub(r"#[^\n]*", "", listed[1])
+            yield [quoted or bare for quoted, bare in _WORD.findall(inside)]
+    else:
+        content: dict[str, Any] = {}
+        with contextlib.suppress(InterchangeError):  # no YAML
+            content = document.content
+        yield from _yaml_nodes(content) or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
+
+
+def _calls(text: str) -> Iterator[str]:
+    """Each ``Node(…)`` of a Python file, to its closing bracket."""
+    begin = _CALL.search(text)
+    while begin is not None:
+        depth, end = 0, len(text)
+        for mark in _MARK.finditer(text, begin.start()):
+            depth += {"(": 1, ")": -1}.get(mark[0], 0)
+            if depth == 0 and mark[0] == ")":
+                end = mark.end()
+                break
+        yield text[begin.start() : end]
+        begin = _CALL.search(text, end)
+
+
+def _yaml_nodes(content: Any) -> list[str]:
+    parts = list(content.values()) if isinstance(content, Mapping) else content if isinstance(content, list) else []
+    if isinstance(content, Mapping) and content.get("exec") == "static_transform_publisher":
+        return [str(content.get("args", ""))]
+    return [args for part in parts for args in _yaml_nodes(part)]
 
 
 _PUBLISHED = (
     "--x --y --z, --qx … --qw or --roll --pitch --yaw, --frame-id PARENT --child-frame-id CHILD; or "
     "x y z qx qy qz qw PARENT CHILD"
 )
-
-
 _OPTIONS = ("x", "y", "z", *_QUATERNION, *_ANGLES, "frame-id", "child-frame-id")
 
 
