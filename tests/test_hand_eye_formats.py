@@ -344,3 +344,23 @@ def test_a_fixed_camera_is_recognised_by_the_other_frame_and_overruled_by_name(f
 def test_a_gripper_s_own_base_is_none_of_the_robot_s(frame: str):
     found = read_hand_eye(FILES["static transform, by place"].replace("tool0", frame).encode(), "x")
     assert found is not None and found.gripper_frame == frame
+
+
+@pytest.mark.parametrize("variance", [-1.0, 0.0])
+def test_a_covariance_that_is_none_is_not_imported(variance: float, tmp_path: Path, capsys):
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, variance])
+    hand_eye = HandEye(to_record(invert(GRIP_T_CAM)), tuple(covariance.ravel().tolist()))
+    path, out = tmp_path / "theirs.json", tmp_path / "reference.yaml"
+    path.write_text(write_hand_eye(hand_eye, "json", []))
+    for command in (["import", str(path), "--out", str(out)], ["verify", str(path), str(path)]):
+        assert main(["calibrate", *command]) == 2
+        said = capsys.readouterr().err
+        assert "theirs.json: reference.covariance: " in said and "a symmetric 6x6 matrix with positive eigen" in said
+    assert not out.exists()
+
+
+def test_a_camera_s_name_that_the_file_contradicts_is_refused():
+    assert read_hand_eye(EASY_1.encode(), "x", which=FRAMES[1]) is not None
+    for which, wrong in (("tool0", "tool0: isn't the camera's frame"), ("thing", "holds no frame thing")):
+        with pytest.raises(InterchangeError, match=f"x: {wrong}; .*{FRAMES[1]}"):
+            read_hand_eye(EASY_1.encode(), "x", which=which)

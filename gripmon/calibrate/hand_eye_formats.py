@@ -139,6 +139,8 @@ def _product(transforms: Iterable[Array]) -> Array:
 def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
     """From the gripper to the camera, whichever of both is the parent."""
     said = pair.camera or which
+    if which not in (None, said):
+        raise InterchangeError(file, which or "", "isn't the camera's frame", f"{said}, as the file says")
     own = [bool(_CAMERA.search(name)) for name in pair.frames]
     if pair.camera is None and all(own):
         wrong = f"leads from {pair.parent} to {pair.child}, both of them a camera's by their names"
