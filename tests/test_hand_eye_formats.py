@@ -364,3 +364,6 @@ def test_a_camera_s_name_that_the_file_contradicts_is_refused():
     for which, wrong in (("tool0", "tool0: isn't the camera's frame"), ("thing", "holds no frame thing")):
         with pytest.raises(InterchangeError, match=f"x: {wrong}; .*{FRAMES[1]}"):
             read_hand_eye(EASY_1.encode(), "x", which=which)
+    for text in (FILES["static transform, by place"].encode(), urdf(MOUNT, COLOR, LENS)):
+        with pytest.raises(InterchangeError, match="tool0: isn't the camera's frame; camera_"):
+            read_hand_eye(text, "x", which="tool0")

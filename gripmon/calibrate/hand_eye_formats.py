@@ -138,15 +138,15 @@ def _product(transforms: Iterable[Array]) -> Array:
 
 def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
     """From the gripper to the camera, whichever of both is the parent."""
-    said = pair.camera or which
-    if which not in (None, said):
-        raise InterchangeError(file, which or "", "isn't the camera's frame", f"{said}, as the file says")
     own = [bool(_CAMERA.search(name)) for name in pair.frames]
     if pair.camera is None and all(own):
         wrong = f"leads from {pair.parent} to {pair.child}, both of them a camera's by their names"
         right = "also how the camera is mounted: transforms from the gripper's frame on"
         raise InterchangeError(file, "", wrong, right)
-    cameras = [name == said for name in pair.frames] if said else own
+    known = pair.camera or (pair.frames[own.index(True)] if any(own) else which)
+    if which not in (None, known):
+        raise InterchangeError(file, which or "", "isn't the camera's frame", f"{known}, as the file says")
+    cameras = [name == known for name in pair.frames]
     if cameras[0] == cameras[1]:
         right = f"gripmon calibrate import with --camera {pair.child}, or {pair.parent} if that is the camera's"
         raise InterchangeError(file, "", f"leads from {pair.parent} to {pair.child}: which is the camera's?", right)
@@ -299,10 +299,10 @@ def _commands(document: Document) -> Iterator[str | list[str]]:
             inside = "" if listed is None else re.sub(r"#[^\n]*", "", listed[1])
             yield [quoted or bare for quoted, bare in _WORD.findall(inside)]
     else:
-        content: dict[str, Any] = {}
-        with contextlib.suppress(InterchangeError):  # no YAML
-            content = document.content
-        yield from _yaml_nodes(content) or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
+        nodes: list[str] = []
+        with contextlib.suppress(InterchangeError, RecursionError):  # no YAML
+            nodes = _yaml_nodes(document.content)
+        yield from nodes or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
 
 
 def _calls(text: str) -> Iterator[str]:
