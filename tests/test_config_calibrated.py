@@ -125,7 +125,7 @@ def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.0, 0.0, -0.1]),
          "hand_eye.yaml: cam_T_grip.translation_m: puts the TCP behind the camera"),
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.2, 0.0, 0.05]),
-         "puts all corners along the camera's x: the axes of a ROS body such as camera_link"),
+         "puts all corners outside of the image, along the camera's x: the axes of a ROS body such as camera_link"),
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.2, 0.0, 0.001]),
          "puts the TCP along the camera's x: the axes of a ROS body such as camera_link"),
         (HE, lambda v: v.update(covariance=[0.0] * 36), "hand_eye.yaml: covariance: has a variance of zero"),

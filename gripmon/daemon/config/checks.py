@@ -200,7 +200,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
     key = "reference.cam_T_grip"
     depths_m = view.corners_cam_m[:, 2]
     if not view.in_image.any() and lies_along_x(view.corners_cam_m.mean(axis=0)):  # a wide lens may see it there
-        return Fault(key, f"puts all corners {_ALONG_X}", _OPTICAL)
+        return Fault(key, f"puts all corners outside of the image, {_ALONG_X}?", _OPTICAL)
     if (depths_m <= 0.0).all():
         return Fault(key, "puts all corners of the gripper behind the camera", _IN_FRONT)
     if (depths_m <= 0.0).any():
