@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from support.camera_texts import COLMAP, KALIBR, OPENICC, ORB2, ORB3, OST, REALSENSE, STEREO, VINS
 
 from gripmon.calibrate.camera_files import LARGEST_TANGENTIAL, read_camera
 from gripmon.calibrate.foreign import InterchangeError
@@ -16,176 +18,11 @@ from gripmon.cli import main
 from gripmon.daemon.calibrations import camera_in
 from gripmon.daemon.config.calibrated import read_camera as read_any_camera
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, make_camera
+from gripmon.model.errors import InputError
 
 POINTS_M = np.column_stack(
     [np.random.default_rng(3).uniform(-0.25, 0.25, (100, 2)), np.random.default_rng(4).uniform(0.9, 1.4, 100)]
 )
-KALIBR = """%YAML:1.0
-
-cam0:
-  T_imu_cam: #rotation from camera to IMU R_CtoI, position of camera in IMU p_CinI
-    - [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975]
-    - [0.0, 0.0, 0.0, 1.0]
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-  distortion_model: radtan
-  intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
-  resolution: [752, 480]
-  rostopic: /cam0/image_raw
-cam1:
-  T_imu_cam: !!opencv-matrix
-    rows: 1
-    cols: 1
-    dt: d
-    data:[1.]
-  camera_model: pinhole
-  distortion_coeffs: [-0.0135, 0.0020, -0.0117, 0.0025]
-  distortion_model: equidistant
-  intrinsics: [190.44, 190.44, 252.59, 254.94]
-  resolution: [512, 512]
-"""
-STEREO = """%YAML:1.0
----
-M1: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 5.3480e+02, 0., 3.3543e+02, 0., 5.3480e+02, 2.4094e+02, 0., 0., 1. ]
-D1: !!opencv-matrix
-   rows: 1
-   cols: 14
-   dt: d
-   data: [ -2.7e-01, 7.0e-02, 1.7e-03, -2.8e-04, 1.0e-02, 0., 0., 0., 0., 0., 0., 0., 0., 0. ]
-M2: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 5.3280e+02, 0., 3.3443e+02, 0., 5.3280e+02, 2.4194e+02, 0., 0., 1. ]
-D2: !!opencv-matrix
-   rows: 1
-   cols: 14
-   dt: d
-   data: [ -2.8e-01, 8.0e-02, 1.0e-03, 2.0e-04, 0., 0., 0., 0., 0., 0., 0., 0., 0., 0. ]
-"""
-ORB2 = """%YAML:1.0
-
-#--- Camera Parameters, of the rectified images ---
-Camera.fx: 435.2046959714599
-Camera.fy: 435.2046959714599
-Camera.cx: 367.4517211914062
-Camera.cy: 252.2008514404297
-Camera.k1: 0.0
-Camera.k2: 0.0
-Camera.p1: 0.0
-Camera.p2: 0.0
-Camera.width: 752
-Camera.height: 480
-LEFT.height: 480
-LEFT.width: 752
-LEFT.D: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data:[-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0]
-LEFT.K: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [458.654, 0.0, 367.215, 0.0, 457.296, 248.375, 0.0, 0.0, 1.0]
-"""
-ORB3 = """%YAML:1.0
-
-File.version: "1.0"
-Camera.type: "KannalaBrandt8"
-Camera1.fx: 190.978477
-Camera1.fy: 190.973307
-Camera1.cx: 254.931706
-Camera1.cy: 256.897442
-Camera1.k1: 0.003482389402
-Camera1.k2: 0.000715034845
-Camera1.k3: -0.002053236141
-Camera1.k4: 0.000202936736
-Camera.width: 512
-Camera.height: 512
-IMU.T_b_c1: !!opencv-matrix
-   rows: 2
-   cols: 2
-   dt: f
-   data: [-0.9, 0.0,
-         0.0, 1.0]
-"""
-VINS = """%YAML:1.0
----
-model_type: KANNALA_BRANDT
-camera_name: fisheye
-image_width: 640
-image_height: 512
-projection_parameters:
-   k2: -0.0612
-   k3: -0.0038
-   k4: 0.0273
-   k5: -0.0303
-   mu: 413.326
-   mv: 413.702
-   u0: 305.951
-   v0: 259.444
-"""
-OPENICC = {
-    "final_reproj_error": 0.17, "fps": 60.0, "image_height": 1080, "image_width": 1920, "intrinsic_type": "FISHEYE",
-    "intrinsics": {
-        "aspect_ratio": 1.0026, "focal_length": 420.568, "principal_pt_x": 959.857, "principal_pt_y": 542.815,
-        "radial_distortion_1": -0.0119, "radial_distortion_2": -0.0392, "radial_distortion_3": 0.0185,
-        "radial_distortion_4": -0.005, "skew": 0.0,
-    }, "nr_calib_images": 129, "stabelized": False,
-}  # fmt: skip
-OST = """# oST version 5.0 parameters
-
-
-[image]
-
-width
-640
-
-height
-480
-
-[narrow_stereo]
-
-camera matrix
-511.143797 0.000000 311.770522
-0.000000 509.020589 247.452470
-0.000000 0.000000 1.000000
-
-distortion
-0.198900 -0.317682 0.002252 -0.001667 0.000000
-
-rectification
-1.000000 0.000000 0.000000
-0.000000 1.000000 0.000000
-0.000000 0.000000 1.000000
-
-projection
-525.563232 0.000000 310.049056 0.000000
-0.000000 524.047913 247.700893 0.000000
-0.000000 0.000000 1.000000 0.000000
-"""
-COLMAP = """# Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
-# Number of cameras: 4
-1 SIMPLE_RADIAL 3072 2304 2559.81 1536 1152 -0.0205
-2 OPENCV 1280 720 900.5 901.25 640.5 360.25 -0.1 0.05 0.001 -0.002
-3 FULL_OPENCV 1280 720 1100.5 1101.25 640.5 360.25 0.31 -0.12 0.001 -0.002 0.01 0.52 0.03 0.001
-4 OPENCV_FISHEYE 1280 720 500.5 501.25 640.5 360.25 0.01 -0.004 0.0015 -2e-05
-5 RADIAL_FISHEYE 1280 720 500.5 640.5 360.25 0.01 -0.004
-6 PINHOLE 1280 720 900.5 901.25 640.5 360.25
-"""
-REALSENSE = {
-    "color": {"width": 848, "height": 480, "fx": 604.7, "fy": 604.5, "ppx": 421.9, "ppy": 246.6,
-              "model": "distortion.brown_conrady", "coeffs": [-0.05, 0.06, 5e-4, -3e-4, -0.02]},
-    "depth": {"width": 848, "height": 480, "fx": 422.0, "fy": 422.0, "ppx": 424.1, "ppy": 238.7,
-              "model": "Kannala Brandt4", "coeffs": [-0.0022, 0.0376, -0.0364, 0.0059, 0.0]},
-}  # fmt: skip
 
 
 def by_opencv(size, matrix, lens, fisheye: bool = False) -> tuple[tuple[int, int], np.ndarray]:
@@ -212,6 +49,9 @@ KNOWN = {
         (640, 512), (413.326, 413.702, 305.951, 259.444), (-0.0612, -0.0038, 0.0273, -0.0303), True)),
     "openicc": (json.dumps(OPENICC), None, by_opencv(
         (1920, 1080), (420.568, 420.568 * 1.0026, 959.857, 542.815), (-0.0119, -0.0392, 0.0185, -0.005), True)),
+    "ost of Windows, the image last": (
+        "\n".join([OST[OST.index("[narrow") :], OST[: OST.index("[narrow")]]).replace("\n", "\r\n"), None, by_opencv(
+        (640, 480), (511.143797, 509.020589, 311.770522, 247.452470), (0.1989, -0.317682, 0.002252, -0.001667))),
     "ost": (OST, None, by_opencv(
         (640, 480), (511.143797, 509.020589, 311.770522, 247.452470), (0.1989, -0.317682, 0.002252, -0.001667))),
     # COLMAP's first pixel has its centre at 0.5.
@@ -362,6 +202,12 @@ REFUSED = [
     (OST.replace("camera matrix\n511.143797", "camera matrix\n"), r"camera matrix: holds 8 values; 3 x 3 numbers"),
     (json.dumps({**ECHO, "d": D, "k": [0.0] * 9}), "k: is all zeros: an uncalibrated camera"),
     (json.dumps({**ECHO, "d": D, "k": K, "roi": {"x_offset": 8, "width": 640, "height": 480}}), "roi: .* isn't part"),
+    (KALIBR.partition("cam1")[0].replace("radtan", "[radtan]"), r"distortion_model: \['radtan'\] is not a model"),
+    (json.dumps({**ECHO, "d": D, "k": K, "distortion_model": {"a": 1}}), "distortion_model: {'a': 1} is not a model"),
+    (json.dumps({**ECHO, "d": D, "k": K}).replace("640", "6" * 5000), "not YAML: Exceeds the limit"),
+    (OST.replace("width\n640", "width\n640.7"), r"\[image\] width: '?640.7'? is not a whole number; a num"),
+    (OST.replace("width\n640", "width\n640 480"), r"\[image\] width: \['640', '480'\] is not a number"),
+    (COLMAP.split("\n")[8].replace("1280", "1" * 5000), "camera 6: width: '11.* is not a number"),
     ("camera_matrix: {rows: 3, cols: 3, data: [1]}\ndistortion_model: equidistant\n", "image_width: is missing"),
 ]  # fmt: skip
 
@@ -406,3 +252,39 @@ def test_a_lens_with_more_coefficients_than_a_fisheye_has_comes_back_as_it_went_
                "d": [-0.05, 0.03, 0.0040371, 0.011349, -0.02]}  # fmt: skip
     lens = read_camera(json.dumps(message).encode(), "x").camera
     assert lens.coefficients[2:4] == (0.0040371, 0.011349)
+
+
+def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "cam.yaml"
+    path.write_text(VINS)
+
+    def forbidden(*_args: object, **_kwargs: object) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    for name in ("read_bytes", "read_text"):
+        monkeypatch.setattr(Path, name, forbidden)
+    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); a readable YAML file"):
+        read_any_camera(path)
+
+
+def test_a_size_as_one_list_may_have_the_height_first_and_is_asked_for():
+    def listed(size: str) -> bytes:
+        text = opencv_file([-0.03, 0.005, 1e-3, 0.0, 0.0]).decode()
+        return text.replace("image_width: 640\nimage_height: 480", f"image_size: {size}").encode()
+
+    assert read_camera(listed("[640, 480]"), "x").camera.width_px == 640
+    with pytest.raises(InterchangeError, match=r"has the size \[480, 640\], .* middle of 640 x 480 px; .* --size"):
+        read_camera(listed("[480, 640]"), "x")
+    for size in ((640, 480), (480, 640)):
+        camera = read_camera(listed("[480, 640]"), "x", size_px=size).camera
+        assert (camera.width_px, camera.height_px) == size
+    with pytest.raises(InterchangeError, match="says that images are 480 x 640 px"):
+        read_camera(listed("[480, 640]"), "x", size_px=(320, 240))
+
+
+def test_blank_lines_cost_no_more_than_others():
+    """Each was searched to the end of all of them: 20000 took 1 s of processor time, 100000 25 times as much."""
+    began = time.process_time()
+    with pytest.raises(InterchangeError, match="is in no format"):
+        read_camera(b"a: 1\n" + b" \n" * 100_000, "x")
+    assert time.process_time() - began < 10.0

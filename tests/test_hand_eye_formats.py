@@ -122,6 +122,8 @@ FILES = {
     "--child-frame-id camera_color_optical_frame --ros-args -r __node:=a\n",
     "static transform, angles": f"{COMMAND} --x {X} --y {Y} --z {Z} --roll {ROLL} --pitch {PITCH} --yaw {YAW} "
     "--frame-id tool0 --child-frame-id camera_color_optical_frame\n",
+    "static transform, with =": f"{COMMAND} --x={X} --y={Y} --z={Z} --qx={QX} --qy={QY} --qz={QZ} --qw={QW} "
+    "--frame-id=tool0 --child-frame-id=camera_color_optical_frame 2>&1 >/dev/null &  # the wrist\n",
     "static transform, by place": f"{COMMAND} {X} {Y} {Z} {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame\n",
     "static transform, ROS 1's period": "rosrun tf static_transform_publisher "
     f"{X} {Y} {Z} {YAW} {PITCH} {ROLL} tool0 camera_color_optical_frame 100 __name:=a\n",
@@ -131,6 +133,20 @@ FILES = {
     f'<joint name="cam" type="fixed"><origin xyz="{X} {Y} {Z}" rpy="{ROLL} {PITCH} {YAW}"/><parent link="tool0"/>'
     '<child link="camera_color_optical_frame"/></joint></robot>',
 }
+
+
+# A name is no executable.
+OTHERS = '''Node(package="a", executable="b", name="static_transform_publisher_b", arguments=["--x", f(1)]),
+        Node(package="tf2_ros", name="static_transform_publisher_cam (\\")",'''
+FILES["moveit 2, among other nodes"] = MOVEIT_2.replace("Node(\n", OTHERS, 1).replace(
+    "        ),\n", '        ),\n        Node(executable="c", arguments=["static_transform_publisher", "--y"]),\n', 1
+)
+FILES["moveit 1, among other nodes"] = MOVEIT_1.replace(
+    "  <node", '  <node pkg="a" type="b" name="static_transform_publisher_b" args="1 2 3" />\n  <node', 1
+).replace("camera_link_broadcaster", "static_transform_publisher_camera_link_broadcaster")
+FILES["static transform, in YAML with names"] = FILES["static transform, in YAML"].replace(
+    "    pkg", "    name: static_transform_publisher cam\n    pkg"
+).replace("launch:\n", "launch:\n- node: {pkg: a, exec: b, name: static_transform_publisher_b, args: 1 2 3}\n")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -181,6 +197,26 @@ def test_a_camera_link_is_recognised_by_its_axes_and_named(frame: str):
     assert read_hand_eye(FILES["moveit 1"].replace(FRAMES[1], "camera_link").encode(), "x") is not None
 
 
+def along_x(frame: str, z: float) -> str:
+    """An effector whose x points out of it, and a camera with the same axes 0.1 m behind it."""
+    still = EASY_1.replace(f"qw: {QW}", "qw: 1").replace(f"qx: {QX}", "qx: 0").replace(f"x: {X}", "x: -0.1")
+    return still.replace(f"y: {Y}", "y: 0").replace(f"z: {Z}", f"z: {z}").replace(FRAMES[1], frame)
+
+
+def test_a_camera_link_of_an_effector_with_x_forward_is_recognised_by_its_name_or_doubted(tmp_path: Path, capsys):
+    with pytest.raises(InterchangeError, match="ends in camera_link, whose x points along the gripper"):
+        read_hand_eye(along_x("camera_link", -0.06).encode(), "x")
+    sideways = read_hand_eye(along_x("camera_optical_frame", -0.06).encode(), "x")
+    assert sideways is not None and not sideways.doubt
+    path, out = tmp_path / "theirs.yaml", tmp_path / "reference.yaml"
+    path.write_text(along_x("camera_link", -0.12))
+    assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
+    said = "camera_link may have the axes of a ROS body such as camera_link (x forward, y left, z up) instead"
+    assert f"warning: {said}" in capsys.readouterr().out and f"# {said}" in out.read_text()
+    assert main(["calibrate", "verify", str(path), str(path)]) == 2
+    assert said in capsys.readouterr().err
+
+
 REFUSED = [
     (EASY_1.replace("eye_on_hand: true", "eye_on_hand: false"), "robot's base to camera_color_optical_frame; is a"),
     (EASY_2.replace("eye_in_hand", "eye_on_base"), "is a fixed camera's pose; gripmon calibrate robot-world"),
@@ -190,7 +226,15 @@ REFUSED = [
     (EASY_1.replace("  qw: 0.9", "  qw: 0.7"), "its quaternion has length 0.8"),
     (EASY_1.replace("  z: -0.119\n", ""), "transformation.z: is missing"),
     (EASY_2.replace("y: -0.063", "y: much"), "transform.translation.y: 'much' is not a number"),
-    (FILES["static transform, options"].replace("--child-frame-id", "--other"), "child-frame-id: is missing; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id", "--other"), "'--other' is no option of it; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id", "--frame-id"), "'--frame-id' is there twice; --x"),
+    (FILES["static transform, options"].replace("--x", "--x 0.1 --x"), "'--x' is there twice; --x"),
+    (FILES["static transform, angles"].replace("--yaw", "--Yaw"), "'--Yaw' is no option of it; --x"),
+    (FILES["static transform, angles"].replace("--yaw", "--qz"), "--roll and --qz are two rotations; angles or a quat"),
+    (FILES["static transform, options"].replace("--x 0.012", "0.012"), "'0.012' is no option of it; --x"),
+    (FILES["static transform, options"].replace("--child-frame-id camera_color_optical_frame", ""), "child-frame"),
+    (FILES["static transform, options"].rstrip() + " --x", "'--x' is there twice"),
+    (FILES["static transform, by place"].rstrip() + " 100 0.5", "'0.5' is more than it takes; --x"),
     (FILES["static transform, by place"].replace(FRAMES[1], "thing"), "which is the camera.s.* --camera thing, or"),
     (body("a_cam") + body("b_cam"), "holds 2 transforms; gripmon calibrate import with --camera a_cam or b_cam"),
 ]  # fmt: skip
@@ -227,3 +271,99 @@ def test_a_flange_behind_the_camera_is_imported_and_completed_by_hand(tmp_path: 
     assert out.read_text() != text and main(["calibrate", "verify", str(out), str(out)]) == 0
     assert main(["calibrate", "import", str(path), "--model", "fisheye", "--out", str(tmp_path / "x.yaml")]) == 2
     assert "is a hand/eye transform (easy_handeye2)" in capsys.readouterr().err
+
+
+def joint(parent: str, child: str, xyz: str, rpy: str = "0 0 0", more: str = "") -> str:
+    return (
+        f'<joint name="{parent}-{child}" type="fixed"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
+    )
+
+
+def urdf(*joints: str) -> bytes:
+    return f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{"".join(joints)}</robot>'.encode()
+
+
+OPTICAL = "-1.5707963267948966 0 -1.5707963267948966"
+MOUNT = joint("tool0", "camera_link", "0.05 0 -0.1", "0 -1.5707963267948966 0")
+COLOR = joint("camera_link", "camera_color_frame", "0 0.015 0")
+LENS = joint("camera_color_frame", "camera_color_optical_frame", "0 0 0", OPTICAL)
+DEPTH = joint("camera_link", "camera_depth_optical_frame", "0 0 0", OPTICAL)
+ARM = joint("wrist_3_link", "flange", "0 0 0") + joint("flange", "tool0", "0 0 0") + joint("tool0", "finger", "0 0 0.1")
+
+
+@pytest.mark.parametrize("which", [None, "camera_color_optical_frame"])
+def test_the_fixed_joints_of_a_camera_are_joined_up_to_its_mount(which: str | None):
+    found = read_hand_eye(urdf(ARM, MOUNT, LENS, COLOR), "x", which=which)
+    assert found is not None and (found.gripper_frame, found.camera_frame) == FRAMES
+    # camera_link's x is tool0's z, its y tool0's y; the optical axes are right, down, forward.
+    expected = np.array([[0.0, 1, 0, 0.05], [-1, 0, 0, 0.015], [0, 0, 1, -0.1], [0, 0, 0, 1]])
+    np.testing.assert_allclose(found.grip_T_cam, expected, rtol=0.0, atol=1e-12)
+
+
+def test_joints_that_lead_to_no_gripper_are_refused_and_only_ends_are_named():
+    with pytest.raises(InterchangeError, match="both of them a camera's by their names; also how the camera is mount"):
+        read_hand_eye(urdf(COLOR, LENS), "x", which="camera_color_optical_frame")
+    several = urdf(MOUNT, COLOR, LENS, DEPTH)
+    for which, wrong in ((None, "holds 4 transforms"), ("thing", "holds no frame thing")):
+        with pytest.raises(InterchangeError) as refused:
+            read_hand_eye(several, "x", which=which)
+        right = "gripmon calibrate import with --camera camera_color_optical_frame or camera_depth_optical_frame"
+        assert str(refused.value) == f"x: {wrong}; {right}"
+    with pytest.raises(InterchangeError, match="camera_link, whose x points along the gripper"):
+        read_hand_eye(several, "x", which="camera_link")
+    with pytest.raises(InterchangeError, match="holds 2 transforms that lead to camera_link; one parent"):
+        read_hand_eye(urdf(MOUNT, joint("flange", "camera_link", "0 0 0"), COLOR, LENS), "x")
+
+
+def test_what_xacro_would_put_in_matters_in_the_camera_s_joints_only():
+    other = joint("a", "b", "${x} 0 0")
+    assert read_hand_eye(urdf(other, MOUNT, COLOR, LENS), "x") is not None
+    with pytest.raises(InterchangeError, match="joint camera_link-camera_color_frame: xyz"):
+        read_hand_eye(urdf(MOUNT, COLOR.replace("0.015", "${y}"), LENS), "x")
+    inserted = joint("tool0", "camera_link", "", "", '<xacro:insert_block name="origin"/>')
+    with pytest.raises(InterchangeError, match="holds parts of xacro; the URDF that xacro makes of it"):
+        read_hand_eye(urdf(inserted, COLOR, LENS), "x")
+
+
+@pytest.mark.parametrize("frame", ["base_link_inertia", "ur5_base_link", "torso_lift_link", "pedestal", "root"])
+def test_a_fixed_camera_is_recognised_by_the_other_frame_and_overruled_by_name(frame: str):
+    text = FILES["static transform, by place"].replace("tool0", frame)
+    right = f"if {frame} moves with the camera: gripmon calibrate import with --camera {FRAMES[1]}"
+    with pytest.raises(InterchangeError, match=f"is a fixed camera's pose; .*; {right}"):
+        read_hand_eye(text.encode(), "x")
+    found = read_hand_eye(text.encode(), "x", which=FRAMES[1])
+    assert found is not None and found.gripper_frame == frame
+    # Where the name had to choose, it says nothing about the other frame.
+    for other in (text + text.replace("color", "depth"), text.replace(FRAMES[1], "thing")):
+        with pytest.raises(InterchangeError, match=r"is a fixed camera's pose; .* a file with this transform alone"):
+            read_hand_eye(other.encode(), "x", which="thing" if "thing" in other else FRAMES[1])
+
+
+@pytest.mark.parametrize("frame", ["robotiq_85_base_link", "wsg50_base_link", "left/gripper_base", "panda_hand"])
+def test_a_gripper_s_own_base_is_none_of_the_robot_s(frame: str):
+    found = read_hand_eye(FILES["static transform, by place"].replace("tool0", frame).encode(), "x")
+    assert found is not None and found.gripper_frame == frame
+
+
+@pytest.mark.parametrize("variance", [-1.0, 0.0])
+def test_a_covariance_that_is_none_is_not_imported(variance: float, tmp_path: Path, capsys):
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, variance])
+    hand_eye = HandEye(to_record(invert(GRIP_T_CAM)), tuple(covariance.ravel().tolist()))
+    path, out = tmp_path / "theirs.json", tmp_path / "reference.yaml"
+    path.write_text(write_hand_eye(hand_eye, "json", []))
+    for command in (["import", str(path), "--out", str(out)], ["verify", str(path), str(path)]):
+        assert main(["calibrate", *command]) == 2
+        said = capsys.readouterr().err
+        assert "theirs.json: reference.covariance: " in said and "a symmetric 6x6 matrix with positive eigen" in said
+    assert not out.exists()
+
+
+def test_a_camera_s_name_that_the_file_contradicts_is_refused():
+    assert read_hand_eye(EASY_1.encode(), "x", which=FRAMES[1]) is not None
+    for which, wrong in (("tool0", "tool0: isn't the camera's frame"), ("thing", "holds no frame thing")):
+        with pytest.raises(InterchangeError, match=f"x: {wrong}; .*{FRAMES[1]}"):
+            read_hand_eye(EASY_1.encode(), "x", which=which)
+    for text in (FILES["static transform, by place"].encode(), urdf(MOUNT, COLOR, LENS)):
+        with pytest.raises(InterchangeError, match="tool0: isn't the camera's frame; camera_"):
+            read_hand_eye(text, "x", which="tool0")

@@ -6,6 +6,7 @@ doesn't say is asked for, never guessed: which of several cameras, the image's s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -59,12 +60,7 @@ def _checked(
     file: str, lens: FileLens, size_px: tuple[int, int] | None, model: LensModel | None
 ) -> tuple[LensSettings, tuple[str, ...]]:
     """The camera, and a warning if nobody says which model its coefficients belong to."""
-    size = lens.size_px or size_px
-    if size is None:
-        right = "gripmon calibrate import with --size WIDTHxHEIGHT"
-        raise InterchangeError(file, "", "doesn't say the image's size", right)
-    if size_px not in (None, size):
-        raise InterchangeError(file, "", f"says that images are {size[0]} x {size[1]} px", "no --size, or that one")
+    size = _size(file, lens, size_px)
     if lens.fisheye and model == "brown_conrady":
         raise InterchangeError(file, "", "says that its lens is a fisheye", "without --model brown_conrady")
     coefficients, fisheye = lens.coefficients, bool(lens.fisheye)
@@ -91,6 +87,22 @@ def _checked(
     except ValueError as error:
         raise InterchangeError(file, "", f"no camera that can be used: {error}") from None
     return camera, warnings
+
+
+def _size(file: str, lens: FileLens, size_px: tuple[int, int] | None) -> tuple[int, int]:
+    """The image's size; a list of both may have the height first, where the principal point is nearer to the middle."""
+    size, right = lens.size_px or size_px, "gripmon calibrate import with --size WIDTHxHEIGHT"
+    if size is None:
+        raise InterchangeError(file, "", "doesn't say the image's size", right)
+    if lens.as_list and size_px is not None and size_px in (size, size[::-1]):
+        return size_px
+    if size_px not in (None, size):
+        raise InterchangeError(file, "", f"says that images are {size[0]} x {size[1]} px", "no --size, or that one")
+    as_it_is, swapped = (math.dist(lens.pinhole[2:], (0.5 * (w - 1), 0.5 * (h - 1))) for w, h in (size, size[::-1]))
+    if lens.as_list and swapped < as_it_is:
+        wrong = f"has the size [{size[0]}, {size[1]}], but the principal point is nearer to the middle of"
+        raise InterchangeError(file, "", f"{wrong} {size[1]} x {size[0]} px", right)
+    return size
 
 
 def _doubts(file: str, lens: FileLens) -> tuple[str, ...]:

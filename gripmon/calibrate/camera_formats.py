@@ -22,7 +22,7 @@ READ = "a camera of ROS, Kalibr, OpenCV, mrcal, COLMAP, RealSense, ORB-SLAM, VIN
 @dataclass(frozen=True, slots=True)
 class FileLens:
     """A camera in OpenCV's terms.  ``size_px`` and ``fisheye`` are None if the file doesn't say it; ``doubt``: why its
-    coefficients may mean something else.
+    coefficients may mean something else; ``as_list``: the size is a list, where others put the height first.
     """
 
     pinhole: Pinhole
@@ -30,6 +30,7 @@ class FileLens:
     size_px: tuple[int, int] | None
     fisheye: bool | None = False
     doubt: str = ""
+    as_list: bool = False
 
 
 Cameras = Mapping[str, Callable[[], FileLens]]
@@ -41,7 +42,7 @@ def cameras_in(document: Document) -> tuple[str, Cameras]:
     text = document.text
     if "LENSMODEL_" in text:
         return "mrcal", {"camera": partial(_mrcal, document)}
-    if re.search(r"^\s*camera matrix\s*$", text, re.MULTILINE):
+    if re.search(r"^[ \t]*camera matrix[ \t]*$", text, re.MULTILINE):
         return "ost", _ost(document)
     if lines := _COLMAP_LINE.findall(text):
         return "colmap", {line.split()[0]: partial(_colmap, document.file, line) for line in lines}
@@ -125,7 +126,7 @@ def _ost(document: Document) -> Cameras:
     """``ost.txt`` and ``.ini`` of ROS: sections of headings, each with its numbers on the lines below."""
     right = "ost.txt of ROS: [image] with width and height, camera matrix, distortion"
     size: tuple[int, int] | None = None
-    cameras: dict[str, Callable[[], FileLens]] = {}
+    sections: dict[str, FileValues] = {}
     for title, body in _OST_SECTION.findall(document.text):
         content: dict[str, list[str]] = {}
         for words in (line.split() for line in body.splitlines() if line.strip() and not line.lstrip().startswith("#")):
@@ -135,13 +136,13 @@ def _ost(document: Document) -> Cameras:
                 numbers += words
         values = FileValues(document.file, content, right, f"[{title}] ")
         if title == "image":
-            width, height = (int(values.numbers(key, (1,), "a number of pixels")[0]) for key in ("width", "height"))
-            size = width, height
+            single = {key: numbers[0] if len(numbers) == 1 else numbers for key, numbers in content.items()}
+            size = FileValues(document.file, single, right, values.path).size("width", "height")
         elif "camera matrix" in content:
-            cameras[title] = partial(_ost_camera, values, size)
-    if not cameras:
+            sections[title] = values
+    if not sections:
         raise InterchangeError(document.file, "", "holds no camera in a section of its own", right)
-    return cameras
+    return {title: partial(_ost_camera, values, size) for title, values in sections.items()}
 
 
 def _ost_camera(values: FileValues, size: tuple[int, int] | None) -> FileLens:
@@ -190,7 +191,7 @@ def _mrcal(document: Document) -> FileLens:
     return FileLens((fx, fy, cx, cy), tuple(lens), values.size("imagersize"))
 
 
-_COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+(?:[ \t]+[-+.\deE]+)+[ \t]*\r?$", re.MULTILINE)
+_COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+(?:[ \t]+[-+.\deE]+)+[ \t]*$", re.MULTILINE)
 # Focal lengths (one: of both axes), then the centre, then these coefficients, by OpenCV's places; whether a fisheye.
 _COLMAP: dict[str, tuple[int, int, bool]] = {
     "SIMPLE_PINHOLE": (1, 0, False), "PINHOLE": (2, 0, False), "SIMPLE_RADIAL": (1, 1, False), "RADIAL": (1, 2, False),
@@ -202,13 +203,14 @@ _COLMAP: dict[str, tuple[int, int, bool]] = {
 def _colmap(file: str, line: str) -> FileLens:
     """A line of ``cameras.txt``: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]; its first pixel's centre is at 0.5."""
     number, model, width, height, *parameters = line.split()
-    values = FileValues(file, {"parameters": parameters}, "cameras.txt of COLMAP", f"camera {number}: ")
+    content = {"parameters": parameters, "width": width, "height": height}
+    values = FileValues(file, content, "cameras.txt of COLMAP", f"camera {number}: ")
     focals, count, fisheye = values.choice("model", model, _COLMAP)
     right = f"{focals + 2 + count} numbers for {model}"
     found = values.numbers("parameters", (focals + 2 + count,), right)
     centre, lens = found[focals : focals + 2], found[focals + 2 :]
     pinhole = found[0], found[focals - 1], centre[0] - 0.5, centre[1] - 0.5
-    return FileLens(pinhole, lens + (0.0,) * (4 - len(lens)), (int(width), int(height)), fisheye)
+    return FileLens(pinhole, lens + (0.0,) * (4 - len(lens)), values.size("width", "height"), fisheye)
 
 
 _REALSENSE = "intrinsics of librealsense: width, height, fx, fy, ppx, ppy, model, coeffs"
@@ -337,12 +339,14 @@ def _opencv_camera(values: FileValues, key: str, before: str, after: str) -> Fil
     said = " ".join(value for value in values.content.values() if isinstance(value, str))
     other = re.search(r"fisheye|equidist|kannala|omni", said, re.I) if fisheye is None else None
     doubt = "" if other is None else f"mentions {other[0]}"
-    return FileLens(values.pinhole(key), lens, _opencv_size(values, before), fisheye, doubt)
+    size, as_list = _opencv_size(values, before)
+    return FileLens(values.pinhole(key), lens, size, fisheye, doubt, as_list)
 
 
-def _opencv_size(values: FileValues, before: str) -> tuple[int, int] | None:
+def _opencv_size(values: FileValues, before: str) -> tuple[tuple[int, int] | None, bool]:
+    """And whether it is a list."""
     for width, height in ((f"{before}width", f"{before}height"), *_WIDTH_HEIGHT):
         if width in values.content:
-            return values.size(width, height)
+            return values.size(width, height), False
     key = next((k for k in ("cameraResolution", "image_size", "imageSize") if k in values.content), None)
-    return None if key is None else values.size(key)
+    return None if key is None else values.size(key), key is not None

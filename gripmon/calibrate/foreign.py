@@ -89,7 +89,7 @@ class FileValues:
 
     def choice(self, key: str, value: Any, known: Mapping[str, Any]) -> Any:
         """The meaning of one of several names."""
-        if value not in known:
+        if not isinstance(value, str) or value not in known:
             raise self.fault(key, f"{shown(value)} is not a model of gripmon's", " or ".join(known))
         return known[value]
 
@@ -159,7 +159,7 @@ class Document:
     """A file of another program; ``right`` says which may be read."""
 
     def __init__(self, file: str, data: bytes, right: str) -> None:
-        self.file, self.text, self._right = file, text_of(file, data, right), right
+        self.file, self.text, self._right = file, text_of(file, data, right).replace("\r\n", "\n"), right
 
     @functools.cached_property
     def content(self) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Document:
                 found = json.loads(text)
             except json.JSONDecodeError as error:
                 found = {} if error.msg == "Extra data" else None  # JSON lines; else YAML in one line
-            except RecursionError:
+            except (RecursionError, ValueError):  # ValueError: an integer of thousands of digits
                 found = None
         if found is None:
             found = _as_yaml(self.file, _first_document(self.text), self._right)

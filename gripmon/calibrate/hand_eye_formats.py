@@ -4,19 +4,22 @@ files, commands of ``static_transform_publisher``, URDF, and gripmon's own JSON.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
+from gripmon.calibrate.foreign import Document, FileValues, InterchangeError, shown
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array
 
+_ANGLES, _QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
 READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
 UNIT_TOLERANCE = 0.01
 """Largest difference of a quaternion's length from 1: files of four digits are rounded."""
@@ -24,14 +27,17 @@ BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up
 _FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
 _BASE = re.compile(
-    r"(?!.*(?:grip|hand|tool|flange|tcp))(?:.*[_/])?(?:world|map|odom|base(?:_link|_footprint)?|link_?0|table)$", re.I
+    r"(?!.*(?:grip|hand|tool|flange|tcp|finger|jaw|robotiq|wsg|schunk|onrobot|rg[26]|[23]f[_\d]))(?:.*[_/])?"
+    r"(?:world|map|odom|root|base(?:_link|_footprint)?(?:_inertia)?|link_?0|table|stand|pedestal|torso(?:_lift)?(?:_link)?)$",
+    re.I,
 )
+"""Frames that don't move with a gripper, unless they are called after one."""
 
 
 @dataclass(frozen=True, slots=True)
 class ForeignHandEye:
     """The camera's pose in the gripper's frame, ``grip_T_cam`` (4, 4), as a file of the format ``kind`` has it, and the
-    covariance (6·6) of ``cam_T_grip`` if it has that.
+    covariance (6·6) of ``cam_T_grip`` if it has that.  ``doubt``: why it may be in other axes than a camera's.
     """
 
     kind: str
@@ -39,6 +45,7 @@ class ForeignHandEye:
     camera_frame: str
     grip_T_cam: Array
     covariance: tuple[float, ...] | None = None
+    doubt: str = ""
 
 
 def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> ForeignHandEye | None:
@@ -51,28 +58,32 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
     found = list(_transforms(document))
     if not found:
         return None
-    chosen = [one for one in found if which in one.frames] if which else found
-    if which is None and len(found) > 1:
-        chosen = [one for one in found if any(map(_CAMERA.search, one.frames))] or found
-    if len(chosen) != 1:
-        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in chosen or found)}"
-        raise InterchangeError(file, "", f"holds {len(found)} transforms", right)
-    hand_eye = _turned(file, chosen[0], which)
-    if _is_body(invert(hand_eye.grip_T_cam), hand_eye.camera_frame):
-        wrong = f"ends in {hand_eye.camera_frame}, whose x points along the gripper: {BODY_AXES}"
+    pair = _joined(file, _chosen(file, found, which), found)
+    hand_eye = _turned(file, pair, which)
+    if pair.camera is None and _BASE.match(hand_eye.gripper_frame):
+        _refuse_fixed(file, hand_eye, which, len(_likely(found)) == 1)
+    camera = hand_eye.camera_frame
+    body = _body(invert(hand_eye.grip_T_cam), camera)
+    if body:
+        wrong = f"ends in {camera}, whose x points along the gripper: {BODY_AXES}"
         right = f"the pose of its optical frame: ros2 run tf2_ros tf2_echo {hand_eye.gripper_frame} OPTICAL_FRAME"
         raise InterchangeError(file, "", wrong, right)
+    if body is None:
+        doubt = f"{camera} may have {BODY_AXES}; if so, the pose of its optical frame"
+        hand_eye = replace(hand_eye, doubt=doubt)
     return hand_eye
 
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A transform between two frames; ``camera``: which of them is the camera's, if the file says it."""
+    """A transform between two frames, which is read when it is asked for: a file may hold others that can't be read.
+    ``camera``: which of them is the camera's, if the file says it.
+    """
 
     kind: str
     parent: str
     child: str
-    parent_T_child: Array
+    parent_T_child: Callable[[], Array]
     camera: str | None = None
     covariance: tuple[float, ...] | None = None
 
@@ -81,26 +92,94 @@ class _Pair:
         return self.parent, self.child
 
 
+def _likely(found: Sequence[_Pair]) -> list[_Pair]:
+    """Those that end in a camera's last frame by their names; all ends where no name is a camera's."""
+    above = {one.parent for one in found if _CAMERA.search(one.child) or not _CAMERA.search(one.parent)}
+    ends = [one for one in found if one.child not in above]
+    return (
+        [one for one in ends if _CAMERA.search(one.child)]
+        or [one for one in found if _CAMERA.search(one.parent)]  # the gripper in the camera's frame
+        or ends
+        or list(found)
+    )
+
+
+def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
+    """The transform that ends in the camera's frame: the one with that name, or the only likely one."""
+    chosen = likely = _likely(found)
+    if which is not None:
+        chosen = [one for one in found if which == one.child] or [one for one in found if which == one.parent]
+    if len(chosen) != 1:
+        right = f"gripmon calibrate import with --camera {' or '.join(one.child for one in likely)}"
+        wrong = f"holds {len(found)} transforms" if chosen else f"holds no frame {which}"
+        raise InterchangeError(file, "", wrong, right)
+    return chosen[0]
+
+
+def _joined(file: str, pair: _Pair, found: Sequence[_Pair]) -> _Pair:
+    """The transform from the first frame above that isn't the camera's own: what lies between is its mount."""
+    chain = [pair]
+    while pair.camera is None and _CAMERA.search(chain[0].parent):
+        above = [one for one in found if one.child == chain[0].parent and one not in chain]
+        if len(above) > 1:
+            wrong = f"holds {len(above)} transforms that lead to {chain[0].parent}"
+            raise InterchangeError(file, "", wrong, "one parent for each frame")
+        if not above:
+            break
+        chain = [*above, *chain]
+    if len(chain) == 1:
+        return pair
+    return replace(pair, parent=chain[0].parent, parent_T_child=lambda: _product(one.parent_T_child() for one in chain))
+
+
+def _product(transforms: Iterable[Array]) -> Array:
+    return reduce(np.matmul, transforms)
+
+
 def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
     """From the gripper to the camera, whichever of both is the parent."""
-    said = pair.camera or which
-    cameras = [name == said if said else bool(_CAMERA.search(name)) for name in pair.frames]
+    own = [bool(_CAMERA.search(name)) for name in pair.frames]
+    if pair.camera is None and all(own):
+        wrong = f"leads from {pair.parent} to {pair.child}, both of them a camera's by their names"
+        right = "also how the camera is mounted: transforms from the gripper's frame on"
+        raise InterchangeError(file, "", wrong, right)
+    known = pair.camera or (pair.frames[own.index(True)] if any(own) else which)
+    if which not in (None, known):
+        raise InterchangeError(file, which or "", "isn't the camera's frame", f"{known}, as the file says")
+    cameras = [name == known for name in pair.frames]
     if cameras[0] == cameras[1]:
         right = f"gripmon calibrate import with --camera {pair.child}, or {pair.parent} if that is the camera's"
         raise InterchangeError(file, "", f"leads from {pair.parent} to {pair.child}: which is the camera's?", right)
     gripper, camera = pair.frames[:: -1 if cameras[0] else 1]
-    if pair.camera is None and _BASE.match(gripper):
-        raise InterchangeError(file, "", f"leads from {gripper} to {camera}", _FIXED)
-    grip_T_cam = invert(pair.parent_T_child) if cameras[0] else pair.parent_T_child
+    parent_T_child = pair.parent_T_child()
+    grip_T_cam = invert(parent_T_child) if cameras[0] else parent_T_child
     return ForeignHandEye(pair.kind, gripper, camera, grip_T_cam, pair.covariance)
 
 
-def _is_body(cam_T_grip: Array, name: str) -> bool:
-    """Whether the frame's axes are x forward: the gripper points along its x, and lies there or the name isn't an
-    optical frame's.
+def _refuse_fixed(file: str, hand_eye: ForeignHandEye, which: str | None, alone: bool) -> None:
+    """Unless ``which`` repeats what the file says: where it had to choose, it says nothing about the other frame."""
+    gripper, camera = hand_eye.gripper_frame, hand_eye.camera_frame
+    if not (alone and _CAMERA.search(camera)):
+        way_out = "a file with this transform alone, to a frame that is called camera"
+    elif which is None:
+        way_out = f"gripmon calibrate import with --camera {camera}"
+    else:
+        return
+    wrong = f"leads from {gripper} to {camera}"
+    raise InterchangeError(file, "", wrong, f"{_FIXED}; if {gripper} moves with the camera: {way_out}")
+
+
+def _body(cam_T_grip: Array, name: str) -> bool | None:
+    """Whether the frame's axes are x forward; None where its name says so, but they don't.  A gripper's z points
+    along that x, and its origin lies there; of a frame that is called a body's (``camera_link``) one of both is enough,
+    since an effector's own z may not point out of it.
     """
     out, at = cam_T_grip[:3, 2], cam_T_grip[:3, 3]
-    return bool(out[0] > max(abs(out[1]), abs(out[2])) and ("optical" not in name or lies_along_x(at)))
+    turned, lies = lies_along_x(out), lies_along_x(at)
+    called = "optical" not in name.lower() and re.search(r"_(?:link|frame)$", name.lower()) is not None
+    if (turned and (lies or "optical" not in name.lower())) or (lies and called):
+        return True
+    return None if called else False
 
 
 def lies_along_x(cam_t_tcp: Array) -> bool:
@@ -110,8 +189,8 @@ def lies_along_x(cam_t_tcp: Array) -> bool:
 
 
 def _transforms(document: Document) -> Iterator[_Pair]:
-    if "static_transform_publisher" in document.text:
-        yield from _published(document)
+    if "static_transform_publisher" in document.text and (published := list(_published(document))):
+        yield from published
         return
     if document.text.lstrip().startswith("<"):
         yield from _joints(document)
@@ -137,12 +216,12 @@ def _easy_handeye(values: FileValues) -> _Pair:
         raise values.fault("", f"leads from the robot's base to {frames[1]}", _FIXED)
     if first:
         shift = turn = values.below("transformation")
-        keys = ("qx", "qy", "qz", "qw")
+        keys = _QUATERNION
     else:
         shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
         keys = ("x", "y", "z", "w")
     pose = _pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
-    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], pose, frames[1])
+    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], lambda: pose, frames[1])
 
 
 def _own_json(values: FileValues) -> _Pair:
@@ -154,7 +233,7 @@ def _own_json(values: FileValues) -> _Pair:
     # With --gripper-in-camera, the camera's frame is the parent.
     camera, gripper = (parent, child) if np.allclose(np.reshape(matrix, (4, 4)), pose, atol=1e-9) else (child, parent)
     covariance = values.numbers("covariance", (36,), "6 x 6 numbers")
-    return _Pair("json", camera, gripper, pose, camera, covariance)
+    return _Pair("json", camera, gripper, lambda: pose, camera, covariance)
 
 
 def _joints(document: Document) -> Iterator[_Pair]:
@@ -164,65 +243,139 @@ def _joints(document: Document) -> Iterator[_Pair]:
     except (ElementTree.ParseError, ValueError):
         return
     for joint in root.iter("joint"):
-        parent, child, origin = (joint.find(name) for name in ("parent", "child", "origin"))
-        if joint.get("type") != "fixed" or parent is None or child is None:
-            continue
-        at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
-        values = FileValues(document.file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
-        shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
-        pose = make_transform(_from_angles(*turn), np.array(shift))
-        yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+        parent, child = (joint.find(name) for name in ("parent", "child"))
+        if joint.get("type") == "fixed" and parent is not None and child is not None:
+            pose = partial(_joint, document.file, joint)
+            yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+
+
+def _joint(file: str, joint: ElementTree.Element) -> Array:
+    """A joint's transform (4, 4); xacro may insert an origin that isn't in the text."""
+    origin = joint.find("origin")
+    at = {key: (origin.get(key, "") if origin is not None else "").split() or ["0"] * 3 for key in ("xyz", "rpy")}
+    values = FileValues(file, at, "<origin xyz rpy>", f"joint {joint.get('name')}: ")
+    if any("}" in part.tag for part in joint):
+        raise values.fault("", "holds parts of xacro", "the URDF that xacro makes of it")
+    shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
+    return make_transform(_from_angles(*turn), np.array(shift))
 
 
 _COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
-_NODE = re.compile(r"<node\b[^>]*static_transform_publisher[^>]*>")
+_NODE = re.compile(r"<node\b[^>]*>")
+_CALL = re.compile(r"\bNode\(")
+_MARK = re.compile(r""""(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|#[^\n]*|[()]""")
+_EXECUTABLE = re.compile(r"""\b(?:(?:node_)?exec(?:utable)?|type)\s*=\s*["']static_transform_publisher["']""")
 _ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
-_ARGS = re.compile(r"""\bargs["']?\s*[=:]\s*(?:"([^"]*)"|'([^']*)'|([^\n]*))""")
+_ARGS = re.compile(r"""\bargs\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_LINE = re.compile(r"(?:^|[\s/])static_transform_publisher[ \t]+([^\n]*)", re.MULTILINE)
+_SHELL = re.compile(r"\s#|\s\d>|[;&|<>]")
+"""Ends a command: a comment, another command, where its output goes."""
 _WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
 
 
 def _published(document: Document) -> Iterator[_Pair]:
     """``static_transform_publisher`` in a shell's line, or in a launch file (Python, XML, YAML), such as MoveIt's."""
-    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
     kind = "moveit" if "MoveIt" in document.text or "camera_link_broadcaster" in document.text else "static transform"
     if "EYE-TO-HAND" in document.text:
         raise InterchangeError(document.file, "", "says EYE-TO-HAND", _FIXED)
-    for part in _NODE.findall(text) or text.split("static_transform_publisher")[1:]:
-        if python := _ARGUMENTS.search(part):
-            words = [quoted or bare for quoted, bare in _WORD.findall(re.sub(r"#[^\n]*", "", python[1]))]
-        else:
-            args = _ARGS.search(part)
-            line = next((each for each in args.groups() if each is not None), "") if args else part.partition("\n")[0]
-            try:
-                words = shlex.split(line)
-            except ValueError as error:
-                raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
+    for command in _commands(document):
+        try:
+            words = shlex.split(command) if isinstance(command, str) else command
+        except ValueError as error:
+            raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
         yield _command(document.file, kind, words)
 
 
-_PUBLISHED = "--x … --qw … --frame-id PARENT --child-frame-id CHILD, or x y z qx qy qz qw PARENT CHILD"
+def _commands(document: Document) -> Iterator[str | list[str]]:
+    """The arguments of each node with this executable, whatever its name; or of each line of a shell."""
+    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
+    if text.lstrip().startswith("<"):
+        for node in filter(_EXECUTABLE.search, _NODE.findall(text)):
+            args = _ARGS.search(node)
+            yield "" if args is None else args[1] or args[2] or ""
+    elif _CALL.search(text):
+        for node in filter(_EXECUTABLE.search, _calls(text)):
+            listed = _ARGUMENTS.search(node)
+            inside = "" if listed is None else re.sub(r"#[^\n]*", "", listed[1])
+            yield [quoted or bare for quoted, bare in _WORD.findall(inside)]
+    else:
+        nodes: list[str] = []
+        with contextlib.suppress(InterchangeError, RecursionError):  # no YAML
+            nodes = _yaml_nodes(document.content)
+        yield from nodes or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
+
+
+def _calls(text: str) -> Iterator[str]:
+    """Each ``Node(…)`` of a Python file, to its closing bracket."""
+    begin = _CALL.search(text)
+    while begin is not None:
+        depth, end = 0, len(text)
+        for mark in _MARK.finditer(text, begin.start()):
+            depth += {"(": 1, ")": -1}.get(mark[0], 0)
+            if depth == 0 and mark[0] == ")":
+                end = mark.end()
+                break
+        yield text[begin.start() : end]
+        begin = _CALL.search(text, end)
+
+
+def _yaml_nodes(content: Any) -> list[str]:
+    parts = list(content.values()) if isinstance(content, Mapping) else content if isinstance(content, list) else []
+    if isinstance(content, Mapping) and content.get("exec") == "static_transform_publisher":
+        return [str(content.get("args", ""))]
+    return [args for part in parts for args in _yaml_nodes(part)]
+
+
+_PUBLISHED = (
+    "--x --y --z, --qx … --qw or --roll --pitch --yaw, --frame-id PARENT --child-frame-id CHILD; or "
+    "x y z qx qy qz qw PARENT CHILD"
+)
+_OPTIONS = ("x", "y", "z", *_QUATERNION, *_ANGLES, "frame-id", "child-frame-id")
 
 
 def _command(file: str, kind: str, words: list[str]) -> _Pair:
     """By options, or by place: x y z, then yaw pitch roll or a quaternion, both frames, and ROS 1's period."""
     words = words[: words.index("--ros-args")] if "--ros-args" in words else words
-    content: Mapping[str, Any]
     if any(word.startswith("--") for word in words):
-        options = zip(words[::2], words[1::2], strict=False)
-        content = {name.lstrip("-").replace("_", "-"): value for name, value in options}
+        content = _by_options(file, words)
     else:
         words = [word for word in words if not word.startswith("__")]
         by_quaternion = len(words) > 8 and not re.match(r"[A-Za-z/_]", words[6])
-        keys = ["x", "y", "z", *(("qx", "qy", "qz", "qw") if by_quaternion else ("yaw", "pitch", "roll"))]
-        content = dict(zip([*keys, "frame-id", "child-frame-id"], words, strict=False))
+        keys = ["x", "y", "z", *(_QUATERNION if by_quaternion else _ANGLES[::-1]), "frame-id", "child-frame-id"]
+        if len(words) > len(keys) + 1:
+            wrong = f"static_transform_publisher: {shown(words[len(keys) + 1])} is more than it takes"
+            raise InterchangeError(file, "", wrong, _PUBLISHED)
+        content = dict(zip(keys, words, strict=False))
     values = FileValues(file, content, _PUBLISHED, "static_transform_publisher: ")
     parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
+    return _Pair(kind, parent, child, partial(_published_pose, values))
+
+
+def _by_options(file: str, words: Sequence[str]) -> dict[str, str]:
+    """Each once, as ``--x 0.1`` or ``--x=0.1``; its rotation as angles or as a quaternion."""
+    content: dict[str, str] = {}
+    left = iter(words)
+    for word in left:
+        name, equals, value = word.removeprefix("--").partition("=")
+        wrong = "is no option of it" if not word.startswith("--") or name not in _OPTIONS else ""
+        wrong = wrong or ("is there twice" if name in content else "")
+        content[name] = value if equals else next(left, "")
+        if wrong or not content[name]:
+            wrong = f"static_transform_publisher: {shown(word)} {wrong or 'has no value'}"
+            raise InterchangeError(file, "", wrong, _PUBLISHED)
+    both = [next((name for name in names if name in content), "") for names in (_ANGLES, _QUATERNION)]
+    if all(both):
+        wrong = f"static_transform_publisher: --{both[0]} and --{both[1]} are two rotations"
+        raise InterchangeError(file, "", wrong, "angles or a quaternion")
+    return content
+
+
+def _published_pose(values: FileValues) -> Array:
     shift = [values.number(key, 0.0) for key in "xyz"]
-    if any(key in content for key in ("roll", "pitch", "yaw")):
-        angles = [values.number(key, 0.0) for key in ("roll", "pitch", "yaw")]
-        return _Pair(kind, parent, child, make_transform(_from_angles(*angles), np.array(shift)))
-    quaternion = [values.number(f"q{axis}", float(axis == "w")) for axis in "xyzw"]
-    return _Pair(kind, parent, child, _pose(values, shift, quaternion))
+    if any(key in values.content for key in _ANGLES):
+        angles = [values.number(key, 0.0) for key in _ANGLES]
+        return make_transform(_from_angles(*angles), np.array(shift))
+    return _pose(values, shift, [values.number(key, float(key == "qw")) for key in _QUATERNION])
 
 
 def _from_angles(roll: float, pitch: float, yaw: float) -> Array:

@@ -82,6 +82,8 @@ def _foreign(path: Path, data: bytes) -> Calibrated | None:
         return None
     hand_eye = read_hand_eye(data, str(path))
     if hand_eye is not None:
+        if hand_eye.doubt:
+            raise InputError(f"{path}: {hand_eye.doubt}; gripmon calibrate import if it hasn't")
         return _robot(path, reference_values(hand_eye))
     found = foreign_camera(path)
     return None if found is None else Calibrated(str(path), "another program's camera", found.camera)

@@ -13,7 +13,7 @@ from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.interchange import FORMATS, Exported, write_camera
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.calibrations import read_bytes, read_calibrated
-from gripmon.daemon.robot_file import reference_values
+from gripmon.daemon.robot_file import reference_values, robot_reference
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
@@ -44,6 +44,10 @@ def import_calibration(
         if hand_eye.covariance is None:
             tcp = f"if the TCP isn't at {hand_eye.gripper_frame} (x across the jaws, z out): flange_T_tcp in this file"
             notes, lines = [*notes, tcp], [*lines, tcp]
+        else:
+            robot_reference(path, reference_values(hand_eye))  # whole: nothing is to be completed
+        if hand_eye.doubt:
+            notes, lines = [*notes, hand_eye.doubt], [*lines, f"warning: {hand_eye.doubt}"]
         text = "".join(f"# {note}\n" for note in notes) + as_yaml(reference_values(hand_eye), inline=True)
         return text.encode(), lines
     found = read_foreign_camera(data, str(path), which=which, size_px=size_px, model=model)

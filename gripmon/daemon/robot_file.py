@@ -10,7 +10,7 @@ import numpy as np
 from gripmon import __version__
 from gripmon.calibrate.documents import HandEyeCalibration
 from gripmon.calibrate.hand_eye_formats import ForeignHandEye
-from gripmon.daemon.config.checks import reference_transform
+from gripmon.daemon.config.checks import covariance_of, reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_document, read_yaml
@@ -71,6 +71,7 @@ def robot_reference(path: Path, values: dict[str, object]) -> ReferenceSettings:
     try:
         settings = to_settings(values, ReferenceSettings, "")
         reference_transform(settings)
+        covariance_of(settings)
     except SettingsError as error:
         raise InputError(f"{path}: {error.fault.key}: {error.fault.wrong}; {error.fault.right}") from None
     return settings

@@ -78,7 +78,7 @@ def foreign_camera(path: Path) -> CameraCalibration | None:
         return None
     try:
         found = camera_files.read_camera(path.read_bytes(), str(path))
-    except UnknownFormatError:
+    except (OSError, UnknownFormatError):  # the reader of gripmon's own files says why it can't be read
         return None
     if found.warnings:
         raise InputError(f"{path}: {found.warnings[0]}; gripmon calibrate import with --model brown_conrady or fisheye")

@@ -48,6 +48,9 @@ _IN_FRONT = (
     "z > 0 in front of the camera: cam_T_grip maps gripper coordinates to camera coordinates (the inverse was given?)"
 )
 
+_ALONG_X = f"along the camera's x: {BODY_AXES}"
+_OPTICAL = "the pose in the camera's optical frame, e.g. camera_color_optical_frame"
+
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -77,11 +80,10 @@ def reference_transform(settings: ReferenceSettings) -> Array:
     if distance_m > FARTHEST_M:
         unit = f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
         wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({unit})"
+    elif depth_m < NEAREST_M and lies_along_x(translation_m):
+        wrong, right = f"puts the TCP {_ALONG_X}", _OPTICAL
     elif depth_m <= 0.0:
         wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
-        if lies_along_x(translation_m):
-            wrong = f"puts the TCP along the camera's x: {BODY_AXES}"
-            right = "the pose in the camera's optical frame, e.g. camera_color_optical_frame"
     elif depth_m < NEAREST_M:
         wrong = f"puts the TCP {1e3 * depth_m:g} mm in front of the camera"
     if wrong:
@@ -197,6 +199,8 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
     """Why too little of the gripper is visible with this calibration; None if enough is."""
     key = "reference.cam_T_grip"
     depths_m = view.corners_cam_m[:, 2]
+    if not view.in_image.any() and lies_along_x(view.corners_cam_m.mean(axis=0)):  # a wide lens may see it there
+        return Fault(key, f"puts all corners outside of the image, {_ALONG_X}?", _OPTICAL)
     if (depths_m <= 0.0).all():
         return Fault(key, "puts all corners of the gripper behind the camera", _IN_FRONT)
     if (depths_m <= 0.0).any():
