@@ -59,30 +59,11 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
         return is_outermost(np.array(images, np.float32), stations, 0.9)
 
     rng = np.random.default_rng(1)
-    assert np.mean([found(rng, 0) for _ in range(40)]) > (0.9 if texture_dn == 0.0 else 0.5)
+    assert np.mean([found(rng, 0) for _ in range(40)]) > (0.9 if texture_dn == 0.0 else 0.7)
     for face_px in (2, 4):
         assert np.mean([found(rng, face_px) for _ in range(40)]) < 0.1
     if texture_dn == 0.0:  # before one wall nothing shows
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
-
-
-def test_light_on_a_face_is_no_change_of_the_background() -> None:
-    """A wall of 108, much as grey as a face of 4 px, changes as little: a third of such edges passed for outline."""
-    rng = np.random.default_rng(9)
-
-    def found(face_px: int) -> bool:
-        x, images = np.arange(60), []
-        for _ in range(6):
-            back = 108.0 + rng.normal(0.0, 2.5) + 7.0 * cv2.GaussianBlur(rng.normal(size=(60, 60)), (0, 0), 2.0)
-            face, finger = (level * (1.0 + 0.03 * rng.normal()) for level in (105.0, 54.0))
-            image = np.where(x < 30, finger, np.where(x < 30 + face_px, face, back))
-            images.append(cv2.GaussianBlur(image, (0, 0), 0.9) + rng.normal(size=(60, 60)))
-        along = np.column_stack([np.full(15, 29.5), np.arange(15.0, 30.0)])
-        stations = Stations(along, np.tile([1.0, 0.0], (15, 1)), np.ones(15, bool))
-        return is_outermost(np.array(images, np.float32), stations, 0.9)
-
-    assert np.mean([found(4) for _ in range(60)]) < 0.15
-    assert np.mean([found(0) for _ in range(60)]) > 0.35
 
 
 def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:

@@ -364,7 +364,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, "--page", "--camera", camera, "--gripper", tmp_path / "none.yaml"], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "none.yaml", "--gripper", gripper], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "no.yaml", "--gripper", gripper], "not YAML"),
-        ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "height_px"),
+        ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "holds no calibration"),
         ([*page], "no image; image files, or --page --live DEVICE"),
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
         ([image, "--page", "--config", camera, "--jaw-source", "zenoh"], "--jaw-source: --config gives the source"),

@@ -51,8 +51,8 @@ class Border:
             always = "the background is the same there in all images"
             return f"{shown}: {always}; add images with brighter and darker ones{empty}"
         return (
-            f"{shown}: from image to image too little changes to tell where the background begins there, or a face of "
-            "its grey lies beyond; add images with plain bright and dark things behind it"
+            f"{shown}: images contradict each other there, or a face of the background's grey lies beyond; add images "
+            f"with something {kind} and plain behind it"
         )
 
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import ndtr, ndtri, stdtrit
+from scipy.special import fdtri, ndtr, ndtri, stdtrit
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -51,12 +51,11 @@ RISEN = 0.75
 BY_CHANCE = 0.01
 """How often grey levels of backgrounds beyond an edge may be taken for something that stays there."""
 NOT_SURE = 0.05
-"""How often the background may begin farther from an edge than its changes show."""
+"""How often what follows less than half of a background's changes, by chance, may seem to follow more."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
 _STEP_PX = 0.5
 _WIDE_PX, _NARROW_PX = 8.0, 5.0
-_FAR_PX = 4.5
 _GRID_PX = 0.125
 _SMOOTH_PX = 3.0
 
@@ -98,12 +97,6 @@ class Transitions:
 def folds_of(count: int) -> NDArray[np.intp]:
     """The group (n,) of each image that the jackknife leaves out together: at most ten groups, of equal sizes."""
     return np.arange(count) % min(count, MOST_FOLDS)
-
-
-def jackknife_sigma(folds: Array) -> Array:
-    """Standard deviation from results (f, ...), each with one f-th of the images left out."""
-    count = len(folds)
-    return np.asarray(np.sqrt((count - 1) / count * np.square(folds - folds.mean(axis=0)).sum(axis=0)))
 
 
 def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
@@ -207,51 +200,58 @@ def measure_transitions(
 
 
 def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
-    """Whether the background surely begins within :data:`WITHIN_PX` of an edge at these stations in ``images`` (n, h,
-    w): beyond it something else of the gripper, as a narrow face, may lie, of whatever grey level.
+    """Whether the background begins at an edge at these stations in ``images`` (n, h, w), and not :data:`WITHIN_PX` or
+    more beyond it: something else of the gripper, as a narrow face, may lie between, of whatever grey level.
 
-    What stays there differs in the mean from what is farther out (Student's t over the images), and changes of the
-    background from image to image begin beyond it, not at the edge.  Where too little changes nothing shows it.
+    An edge so far out would leave more than a quarter of the contrast open where this is asked.  Grey levels there are
+    compared over the images with those 4.5 to 8 px out.  What stays differs in the mean (Student's t, of means along
+    the edge), or it doesn't change as the background does.  Where that hardly changes nothing shows it.  A face of 8 px
+    and more isn't told from a background that changes as little.
     """
     s = np.arange(-_NARROW_PX, _WIDE_PX + 0.25, _STEP_PX)
     profiles = _read(images, stations, s)
-    if _stays_beyond(profiles.mean(axis=1), s, blur_px):
-        return False
-    at_px, sigma_px, dof = _changes_begin(profiles, s, blur_px)
-    return abs(at_px) + float(stdtrit(dof, 1.0 - NOT_SURE)) * sigma_px < WITHIN_PX
-
-
-def _stays_beyond(levels: NDArray[np.float32], s: Array, blur_px: float) -> bool:
-    """Whether grey levels (n, samples) where the background should have begun differ in the mean from those farther
-    out.  An edge so far out would leave more than a quarter of the contrast open where this is asked.
-    """
+    levels = profiles.mean(axis=1)
     begun_px = WITHIN_PX + float(ndtri(RISEN)) * blur_px
-    far = levels[:, s >= _FAR_PX].mean(axis=1)
-    off = np.array([np.interp(begun_px, s, own) for own in levels]) - far
+    inner, there, outer = (s >= -4.0) & (s <= -2.0), [int(np.searchsorted(s, begun_px))], s >= 4.5
+    far = levels[:, outer].mean(axis=1)
+    near = np.array([np.interp(begun_px, s, own) for own in levels])
+    off = near - far
     scatter = float(np.std(off, ddof=1)) / len(off) ** 0.5
-    inner = levels[:, (s >= -4.0) & (s <= -2.0)].mean(axis=1)
-    contrast = float(np.sqrt(np.square(far - inner).mean()))
+    contrast = float(np.sqrt(np.square(far - levels[:, inner].mean(axis=1)).mean()))
     least = max(float(stdtrit(len(off) - 1, 1.0 - 0.5 * BY_CHANCE)) * scatter, (1.0 - RISEN) * contrast)
-    return abs(float(off.mean())) > least
+    if abs(float(off.mean())) > least:
+        return False
+    return _follows(near, far) or _changes(*(profiles[:, :, at] for at in (inner, there, outer)))
 
 
-def _changes_begin(profiles: NDArray[np.float32], s: Array, blur_px: float) -> tuple[float, float, int]:
-    """Where (px along the normals) the changes begin that grey levels (n, stations, samples) far out show from image to
-    image, its standard deviation by the jackknife, and the degrees of freedom of that.
-
-    The part of them that shows at each distance rises like the transition.  What all images have in common, as the
-    contrast of a dark finger before bright walls, doesn't count: a border between two faces has it as well.
+def _follows(near: Array, far: Array) -> bool:
+    """Whether grey levels (n,) show three quarters of the changes of others (n,), by the straight line through them,
+    and by its slope's standard error surely half.
     """
-    far = profiles[:, :, s >= _FAR_PX].mean(axis=2)
-    fold = folds_of(len(profiles))
-    shown = []
-    for f in range(-1, int(fold.max()) + 1):  # first all of them
-        change = far[fold != f] - far[fold != f].mean(axis=0)
-        total = max(float(np.square(change).sum()), 1e-9)
-        shown.append(np.einsum("ij,ijk->k", change, profiles[fold != f]) / total)
-    near = s <= _WIDE_PX - 1.5
-    at_px = _edge(np.array(shown)[:, near], s[near], blur_px, _FAR_PX - 0.5)[0]
-    return float(at_px[0]), float(jackknife_sigma(at_px[1:])), len(at_px) - 2
+    change = far - far.mean()
+    changes = max(float(change @ change), 1e-9)
+    slope = float(change @ near) / changes
+    rest = near - near.mean() - slope * change
+    sigma = (float(rest @ rest) / (len(far) - 2) / changes) ** 0.5
+    return slope > RISEN and slope - float(stdtrit(len(far) - 2, 1.0 - NOT_SURE)) * sigma > 0.5
+
+
+def _changes(inner: NDArray[np.float32], near: NDArray[np.float32], far: NDArray[np.float32]) -> bool:
+    """Whether grey levels (n, stations, samples) near an edge surely change by half as much as those far out, and by
+    more than those on the finger's side, from image to image and along the edge: a texture, which near doesn't follow
+    (Fisher's F).
+    """
+    variance, dof = [], []
+    for levels in (inner, near, far):
+        off = levels - levels.mean(axis=0)
+        each = float(np.square(off).mean())
+        variance.append(each)
+        # As many places along the edge as its mean is better known than one of them.
+        dof.append((len(levels) - 1) * each / max(float(np.square(off.mean(axis=1)).mean()), 1e-9))
+    return all(
+        variance[1] > part * float(fdtri(dof[1], dof[k], 1.0 - NOT_SURE)) * variance[k]
+        for k, part in ((0, 1.0), (2, 0.25))
+    )
 
 
 def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

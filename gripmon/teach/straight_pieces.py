@@ -21,7 +21,6 @@ from gripmon.teach.silhouette import (
     Stations,
     from_ideal_px,
     is_outermost,
-    jackknife_sigma,
     lines_in_image,
     measure_transitions,
     to_ideal_px,
@@ -81,6 +80,12 @@ class Chain:
         jackknife).
         """
         return jackknife_sigma(self.folds_px).max(axis=1)
+
+
+def jackknife_sigma(folds: Array) -> Array:
+    """Standard deviation from results (f, ...), each with one f-th of the images left out."""
+    count = len(folds)
+    return np.asarray(np.sqrt((count - 1) / count * np.square(folds - folds.mean(axis=0)).sum(axis=0)))
 
 
 def runs(usable: NDArray[np.bool_], uv_px: Array) -> list[tuple[NDArray[np.intp], bool]]:
