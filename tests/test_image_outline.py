@@ -11,7 +11,7 @@ from gripmon.model.staying import Edges
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost
-from gripmon.teach.straight_pieces import WORST_RMS_PX, _joined, _Line, _off_px, _on_curve
+from gripmon.teach.straight_pieces import _joined, _Line
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
@@ -79,17 +79,3 @@ def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() ->
     chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
     assert not chain.corner.any()
     assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01
-
-
-def test_edges_that_lie_apart_are_no_pieces_of_one_curve() -> None:
-    """A fingertip and the pad 8 px behind it, which a gap parts: a vertex halfway bent both, by 4 px."""
-
-    def line(a: list[float], b: list[float]) -> _Line:
-        way = np.subtract(b, a) / np.linalg.norm(np.subtract(b, a))
-        normal = np.array([-way[1], way[0]])
-        distance = float(normal @ a)
-        return _Line(normal, distance, np.tile(normal, (5, 1)), np.full(5, distance), 0.05, np.array([a, b]))
-
-    tip, pad, next_piece = line([0, 0], [25, 0.3]), line([31, 8], [45, 9.5]), line([27, 0.6], [40, 3])
-    assert _off_px((tip, pad), _on_curve(tip, pad)[0]) > WORST_RMS_PX
-    assert _off_px((tip, next_piece), _on_curve(tip, next_piece)[0]) < WORST_RMS_PX

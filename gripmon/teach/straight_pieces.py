@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -218,7 +218,7 @@ def fit_chains(
         (_, one), (_, other) = before, after
         ends = one.ends[1], other.ends[0]
         if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX and _is_smooth(before, after, ideal):
-            return _off_px((one, other), _on_curve(one, other)[0]) <= WORST_RMS_PX
+            return True
         # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
         distances = np.array([[one.distance], [other.distance]])
         meet = _meet(one.normal[None], distances[0], other.normal[None], distances[1])[0]
@@ -453,11 +453,19 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
         corner.append(False)
     for k in range(count if closed else count - 1):
         a, b = k, (k + 1) % count
+        gap = lines[b].ends[0] - lines[a].ends[1]
+        joint = lines[a].ends[1] + 0.5 * gap
+        met = _meet(normals[a], distances[a], normals[b], distances[b])
         if not _is_smooth((spans[a], lines[a]), (spans[b], lines[b]), ideal):
-            vertices.append(_meet(normals[a], distances[a], normals[b], distances[b]))
+            vertices.append(met)
             corner.append(True)
             continue
-        vertices.append(_on_curve(lines[a], lines[b]))
+        # Pieces of a curve meet between what is seen of them, on both lines; or, as the intersection of nearly parallel
+        # lines is uncertain, halfway.
+        feet = [_foot(normals[i], distances[i], joint) for i in (a, b)]
+        share = float(np.clip((met[0] - lines[a].ends[1]) @ gap / max(float(gap @ gap), 1e-9), 0.0, 1.0))
+        near = np.linalg.norm(met[0] - lines[a].ends[1] - share * gap) < 2.0
+        vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
         corner.append(False)
     if not closed:
         vertices.append(_foot(normals[-1], distances[-1], lines[-1].ends[1]))
@@ -468,28 +476,6 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
     uv = from_ideal_px(camera, stacked.reshape(-1, 2)).reshape(stacked.shape)
     rms = np.array([line.rms_px for line in lines])
     return Chain(uv[0], uv[1:], closed, np.array(corner), rms)
-
-
-def _on_curve(before: _Line, after: _Line) -> Array:
-    """Where (1 + f, 2) two pieces of a curve meet, from all images and the folds: between what is seen of them, on both
-    lines; or, as the intersection of nearly parallel lines is uncertain, halfway.
-    """
-    lines = [
-        (np.vstack([each.normal[None], each.fold_normals]), np.append(each.distance, each.fold_distances))
-        for each in (before, after)
-    ]
-    met = _meet(*lines[0], *lines[1])
-    gap = after.ends[0] - before.ends[1]
-    share = float(np.clip((met[0] - before.ends[1]) @ gap / max(float(gap @ gap), 1e-9), 0.0, 1.0))
-    if np.linalg.norm(met[0] - before.ends[1] - share * gap) < 2.0:
-        return met
-    feet = [_foot(normals, distances, before.ends[1] + 0.5 * gap) for normals, distances in lines]
-    return np.asarray(0.5 * (feet[0] + feet[1]))
-
-
-def _off_px(lines: Sequence[_Line], point: Array) -> float:
-    """Largest distance of a point (2,) from lines."""
-    return max(abs(float(each.normal @ point - each.distance)) for each in lines)
 
 
 def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
