@@ -19,10 +19,10 @@ from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
 from gripmon.monitor.ends_told import EndsTold
-from gripmon.monitor.shadow import Shadow, _alike, _texture
+from gripmon.monitor.shadow import Look, Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
-from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen
 from gripmon.track.edges.prediction import EdgeLayout
 
 FRAME_S = 1.0 / 30.0
@@ -34,11 +34,11 @@ class Watching(Shadow):
     seen: Seen
     told: Told
 
-    def _told(self, frame: Frame, looks: list[Measurement], fit: Measurement, now_s: float) -> Told:
+    def _told(self, frame: Frame, looks: list[Look], fit: int, now_s: float) -> Told:
         self.told = super()._told(frame, looks, fit, now_s)
         return self.told
 
-    def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
+    def _seen(self, frame: Frame, looks: list[Look], fit: int) -> Seen | None:
         seen = super()._seen(frame, looks, fit)
         assert seen is not None
         self.seen = seen

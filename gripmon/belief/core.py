@@ -267,9 +267,9 @@ class Belief:
         for h in range(self._hypotheses):
             hope = max(float(candidates.surprise[h]), 0.0) + float(self._nodes.hope[h])
             struck = not asked.first and float(candidates.surprise[h]) > self._rare[int(candidates.own[h])]
+            per_s = jumps.loose_per_s if self._is_loose(h) else jumps.per_s
             for j in range(len(jumps.share)):
-                per_s = self.priors.shakes_per_s if j == 0 and self._is_loose(h) else jumps.per_s[j]
-                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-per_s * dt_s))
+                chance = jumps.share[j] * (jumps.at_first[j] if asked.first else -math.expm1(-per_s[j] * dt_s))
                 if jumps.knock[j] and struck:
                     chance = max(chance, jumps.share[j] * self.priors.unseen_knock)
                 if chance <= 0.0:

@@ -162,10 +162,9 @@ class Told(NamedTuple):
     answer where its ends are there, ``right`` (k, f), and where something else is, ``wrong`` (k, f); ``memory`` (k, f):
     probability that an answer is only one of those before again, ``repeats`` (k, f), the share of these that are the
     same.  Who isn't asked has 0, 0, 1, 1.  ``together`` (k, 2): log likelihood of all fingers' answers where all are
-    right, and all wrong, NaN where these are independent: what lies over all ends answers for all; ``memory_together``
-    and ``repeats_together`` (k,), theirs.  ``rows``
-    (e, 23): px by which the middle of each edge at an end moves with g; ``at`` (k, 23): g where it was looked; ``fit``:
-    at which of these places the image was fitted.
+    right, and all wrong, NaN where these are independent: what lies over all ends answers for all; theirs are
+    ``memory_together`` and ``repeats_together`` (k,).  ``rows`` (e, 23): px by which the middle of each edge at an end
+    moves with g; ``at`` (k, 23): g where it was looked; ``fit``: at which of these places the image was fitted.
     """
 
     right: Array

@@ -11,9 +11,9 @@ import math
 import numpy as np
 
 from gripmon.belief.nodes import Nodes
-from gripmon.belief.rows import forward, normal, strength_of
+from gripmon.belief.rows import forward, normal
 from gripmon.belief.state import SIZE, Bank, Seen
-from gripmon.belief.things import not_drawn
+from gripmon.belief.things import expect_thing, not_drawn
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -35,33 +35,32 @@ def go(nodes: Nodes, i: int, bank: Bank, h: int, noise: Array, seen: Seen, edge:
     """The rows of the line that is nearest to where the thing would be had the gripper stayed; what of their log
     likelihood depends on no set.
     """
-    kind = int(bank.kind[h, edge, 1] > bank.kind[h, edge, 0])
-    like, total = seen.likeness[edge], math.log(1.0 - missed) - math.log(seen.found[edge])
-    missing, variance, way = np.empty((seen.found[edge], 2)), np.empty((seen.found[edge], 2)), np.zeros(SIZE)
-    best, most = 0, -math.inf
+    kind, total = int(bank.kind[h, edge, 1] > bank.kind[h, edge, 0]), -math.log(seen.found[edge])
+    expected_px, variance, way = np.empty(2), np.empty(2), np.zeros(SIZE)
+    place, spread, best, most = np.empty(2), np.empty(3), 0, -math.inf
+    for row in range(2):
+        expect_thing(bank, h, seen, edge, row, kind, 1.0, 0.0, place, spread)
+        expected_px[row] = bank.searched[h, edge, kind, row] + place[0] + place[1]
+        variance[row] = spread[0] + 2.0 * spread[1] + spread[2]
     for of in range(seen.found[edge]):
         log = 0.0
         for row in range(2):
-            place, spread = bank.place[h, edge, kind, row], bank.place_spread[h, edge, kind, row]
-            variance[of, row] = spread[0] + like * (2.0 * spread[1] + like * spread[2])
-            variance[of, row] += (1.0 - like * like) * strength_of(seen, edge, row) + seen.image_white[edge, of, row]
-            missing[of, row] = seen.image[edge, of, row] - bank.searched[h, edge, kind, row]
-            missing[of, row] -= place[0] + like * place[1]
-            log += normal(missing[of, row], variance[of, row] + moved(noise, seen.rows[edge, of, row], way))
+            known = variance[row] + seen.image_white[edge, of, row]
+            by_noise = moved(noise, seen.rows[edge, of, row], way)
+            log += normal(seen.image[edge, of, row] - expected_px[row], known + by_noise)
         if log > most:
             best, most = of, log
     for row in range(2):
-        by_noise = moved(noise, seen.rows[edge, best, row], way)
+        left = moved(noise, seen.rows[edge, best, row], way)
         forward(nodes.root[i], way)
-        known = 0.0
         for j in range(SIZE):
-            known += way[j] * way[j]
-        left = variance[best, row] + max(by_noise - known, 0.0)
+            left -= way[j] * way[j]
+        left = max(left, 0.0) + variance[row] + seen.image_white[edge, best, row]
         total -= 0.5 * math.log(2.0 * math.pi * left)
         for j in range(SIZE):
             nodes.going[i, edge, row, j] = way[j] / math.sqrt(left)
-        nodes.gone[i, edge, row] = missing[best, row] / math.sqrt(left)
-    return total
+        nodes.gone[i, edge, row] = (seen.image[edge, best, row] - expected_px[row]) / math.sqrt(left)
+    return total + math.log(1.0 - missed)
 
 
 @compiled

@@ -12,12 +12,14 @@ from gripmon.model.records import Array
 
 
 class Jumps(NamedTuple):
-    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), or is so ``at_first`` (j,), with ``factors``
-    (j, 6, 23) of its covariance, of which ``ranks`` (j,) rows count; ``knock`` (j,): it is one.
+    """What moves at once: a ``share`` (j,) of what happens ``per_s`` (j,), or ``loose_per_s`` (j,) while the mount is
+    loose, or is so ``at_first`` (j,), with ``factors`` (j, 6, 23) of its covariance, of which ``ranks`` (j,) rows
+    count; ``knock`` (j,): it is one.
     """
 
     share: Array
     per_s: Array
+    loose_per_s: Array
     at_first: Array
     factors: Array
     ranks: Ints
@@ -54,7 +56,8 @@ class Jumps(NamedTuple):
             padded[j, : len(rows)] = rows
         at_first = np.where(np.arange(len(factors)) == len(factors) - 1, priors.opening_first, 0.0)
         ranks = np.array([len(f) for f in factors])
-        return cls(np.array(shares), np.array(rates), at_first, padded, ranks, np.array(knock))
+        loose = np.array([priors.shakes_per_s, *rates[1:]])
+        return cls(np.array(shares), np.array(rates), loose, at_first, padded, ranks, np.array(knock))
 
 
 def _diagonal(sigmas: Sequence[float]) -> Array:

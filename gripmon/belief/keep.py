@@ -12,7 +12,7 @@ from gripmon.belief.nodes import Nodes, weigh
 from gripmon.belief.rows import add_noise, forward, learn
 from gripmon.belief.search import Candidates
 from gripmon.belief.state import OPENING, SIZE, Bank, Ints, Seen
-from gripmon.belief.things import foreign, forget, not_drawn
+from gripmon.belief.things import foreign, forget
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
 
@@ -172,8 +172,7 @@ def remember(
                 fresh, stays = (before >> edge) & 1 == 0, (held >> edge) & 1 == 1
                 foreign(into, q, seen, edge, fresh, stays, sizes, nodes.at[i, edge], nodes.wide[i, edge], True, True)
             elif seen.found[edge] > 0 and nodes.unsearched[i, edge]:
-                fresh = not_drawn(into, q, edge)
-                foreign(into, q, seen, edge, fresh, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, True)
+                foreign(into, q, seen, edge, False, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, True)
             elif seen.found[edge] > 0 and nodes.line[i, edge] >= 0:
                 forget(into, q, edge)
                 learn(into, q, seen, edge, nodes.line[i, edge])

@@ -177,9 +177,8 @@ def take(nodes: Nodes, i: int, bank: Bank, h: int, expected: Expected, seen: See
     if of < 0:
         nodes.hope[i] -= share
     if unsearched:
-        fresh = not_drawn(bank, h, edge)
         nodes.base[i, edge] = foreign(
-            bank, h, seen, edge, fresh, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, False
+            bank, h, seen, edge, False, True, sizes, nodes.at[i, edge], nodes.wide[i, edge], False, False
         )  # fmt: skip
 
 

@@ -66,22 +66,32 @@ def things_seen(bank: Bank, h: int, edge: int, kind: int) -> int:
 
 
 @compiled
-def row_of_thing(
-    bank: Bank, h: int, seen: Seen, edge: int, of: int, row: int, slot: int, stays: float, size: float, place: Array,
+def expect_thing(
+    bank: Bank, h: int, seen: Seen, edge: int, row: int, slot: int, stays: float, size: float, place: Array,
     spread: Array,
-) -> float:  # fmt: skip
-    """Log likelihood of one row of line ``of`` as a remembered thing's, whose ``place`` (2,) learns from it, with its
-    ``spread`` (3,), as in :func:`drawn`.  Of those but the last one seen the background counts as new.
+) -> None:  # fmt: skip
+    """Where a row of a remembered thing is before it is seen again: ``place`` (2,) and ``spread`` (3,) as in
+    :func:`drawn`.  Of those but the last one seen the background counts as new.
     """
-    shown = seen.found[edge] > 0
-    like = 0.0 if slot >= FOREIGN_KINDS else seen.likeness[edge] if shown else 1.0
+    like = 0.0 if slot >= FOREIGN_KINDS else seen.likeness[edge] if seen.found[edge] > 0 else 1.0
     was = bank.place_spread[h, edge, slot, row]
     place[0] = stays * bank.place[h, edge, slot, row, 0]
     place[1] = like * bank.place[h, edge, slot, row, 1]
     spread[0] = stays * stays * was[0] + (1.0 - stays * stays) * size
     spread[1] = stays * like * was[1]
     spread[2] = like * like * was[2] + (1.0 - like * like) * strength_of(seen, edge, row)
-    if not shown:
+
+
+@compiled
+def row_of_thing(
+    bank: Bank, h: int, seen: Seen, edge: int, of: int, row: int, slot: int, stays: float, size: float, place: Array,
+    spread: Array,
+) -> float:  # fmt: skip
+    """Log likelihood of one row of line ``of`` as a remembered thing's, whose ``place`` (2,) learns from it, with its
+    ``spread`` (3,), as in :func:`drawn`.
+    """
+    expect_thing(bank, h, seen, edge, row, slot, stays, size, place, spread)
+    if seen.found[edge] == 0:
         return 0.0
     missing = seen.image[edge, of, row] - bank.searched[h, edge, slot, row]
     return drawn(place, spread, missing, seen.image_white[edge, of, row], seen.white[edge, of, row])

@@ -35,6 +35,12 @@ OPENING_M = 1e-3
 """Change of the opening from which ends are asked anew: other things are beside them."""
 
 
+def off_by_px(look: Measurement, cam_T_grip: Array) -> float:
+    """How far the edges are from where a look searched them, px, at another place: of the edge that moves most."""
+    there = look.prediction
+    return there.moved_px(perturbation_between(there.cam_T_grip, cam_T_grip))
+
+
 @dataclass
 class _Heard:
     """Answers to one question, each by how long ago it was."""
@@ -111,10 +117,9 @@ class EndsTold:
         """The nearest that is near enough, of those at this opening."""
         there = look.prediction
         off_px = [
-            there.moved_px(perturbation_between(there.cam_T_grip, place.cam_T_grip))
-            if abs(there.jaw_opening_m - place.opening_m) < OPENING_M else math.inf
-            for place in self._places
-        ]  # fmt: skip
+            off_by_px(look, p.cam_T_grip) if abs(there.jaw_opening_m - p.opening_m) < OPENING_M else math.inf
+            for p in self._places
+        ]
         if off_px and min(off_px) < LOOKED_PX:
             return self._places[int(np.argmin(off_px))]
         self._places.append(_Place(there.cam_T_grip, there.jaw_opening_m, [_Heard() for _ in range(self._fingers)]))

@@ -7,6 +7,7 @@ is turned, with the pixels that stand beside it; the belief does the rest (:mod:
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor.edge_lines import Frame2d, Parts, found_at, merged
-from gripmon.monitor.ends_told import EndsTold
+from gripmon.monitor.ends_told import EndsTold, off_by_px
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, edges_at_ends, inner_edges, sides
@@ -46,6 +47,16 @@ STILL_NOISES = 1.5
 LIKE_STILL, MOST_LIKE = 0.999, 0.98
 ANOTHER = 0.5
 """Likeness under which a background is another one; different stills reach it in a tenth of the pairs, at most."""
+
+
+class Look(NamedTuple):
+    """A frame searched at a place: the measurement ``of`` it, how far that began ``away`` (6,) from the reference, and
+    how its search lines change with g, ``columns`` (n, 23).
+    """
+
+    of: Measurement
+    away: Array
+    columns: Array
 
 
 class Shadow:
@@ -91,12 +102,13 @@ class Shadow:
         self.newest = None
         if self._last_s is not None and now_s <= self._last_s:
             return
-        looks = self._looks(frame, measurement)
-        seen = self._seen(frame, looks, measurement)
+        looks = [self._look(of) for of in self._searched(frame, measurement)]
+        fit = next(k for k, look in enumerate(looks) if look.of is measurement)
+        seen = self._seen(frame, looks, fit)
         if seen is None:
             return
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
-        told = self._told(frame, looks, measurement, now_s)
+        told = self._told(frame, looks, fit, now_s)
         self.newest = self._belief.update(seen, dt_s, told, opening_m=self._opening_noise_m(frame))
         self._last_s = now_s
 
@@ -110,29 +122,29 @@ class Shadow:
         kept = math.exp(-abs(frame.jaw_opening_m - before) / (2.0 * self._jaw_sigma_m))
         return self._jaw_sigma_m * math.sqrt(1.0 - kept * kept)
 
-    def _told(self, frame: Frame, looks: list[Measurement], fit: Measurement, now_s: float) -> Told:
+    def _told(self, frame: Frame, looks: list[Look], fit: int, now_s: float) -> Told:
         rows, at = np.zeros((len(self._parts), SIZE)), np.zeros((len(looks), SIZE))
-        lies_on, columns = self._parts.of(looks[0].prediction.layout), self._columns(looks[0])
+        lies_on = self._parts.of(looks[0].of.prediction.layout)
         for edge in np.unique(lies_on):
-            rows[edge] = columns[lies_on == edge].mean(axis=0)
+            rows[edge] = looks[0].columns[lies_on == edge].mean(axis=0)
         for k, look in enumerate(looks):
-            at[k, MOTION] = perturbation_between(self._ref_T, look.prediction.cam_T_grip)
-            at[k, OPENING] = look.prediction.jaw_opening_m - self._reported_m(frame)
-        ends = [self._tracker.ends(frame, look) for look in looks]
-        by = next(k for k, look in enumerate(looks) if look is fit)
-        return self._ends_told.told(ends, looks, rows, at, by, now_s)
+            at[k, MOTION] = look.away
+            at[k, OPENING] = look.of.prediction.jaw_opening_m - self._reported_m(frame)
+        measured = [look.of for look in looks]
+        ends = [self._tracker.ends(frame, of) for of in measured]
+        return self._ends_told.told(ends, measured, rows, at, fit, now_s)
 
     def _reported_m(self, frame: Frame) -> float:
         return self._gripper.jaw_nominal_m if frame.jaw_opening_m is None else frame.jaw_opening_m
 
-    def _looks(self, frame: Frame, measurement: Measurement) -> list[Measurement]:
+    def _searched(self, frame: Frame, measurement: Measurement) -> list[Measurement]:
         """The frame as the rules' fit measured it, and at the heaviest places that this isn't near to: what isn't
         looked for isn't found.  The first is that at the heaviest.
         """
         looks, main = [measurement], 0
         for k, (mean, covariance) in enumerate(self._belief.places[:MOST_PLACES]):
             cam_T_grip = perturb(self._ref_T, mean[MOTION] + mean[REFERENCE])
-            if any(_near(look, cam_T_grip) for look in looks):
+            if any(off_by_px(look, cam_T_grip) < LOOKED_PX for look in looks):  # well within its search lines
                 continue
             both = covariance[MOTION, MOTION] + covariance[REFERENCE, REFERENCE]
             sigma = np.sqrt(np.diag(both) + np.repeat([SETTLES_M**2, SETTLES_RAD**2], 3))
@@ -140,19 +152,21 @@ class Shadow:
             looks.append(self._tracker.measure_held(frame, cam_T_grip, sigma))
         return [looks[main], *looks[:main], *looks[main + 1 :]]
 
-    def _seen(self, frame: Frame, looks: list[Measurement], fit: Measurement) -> Seen | None:
-        """The frame's edges, of several looks at it; None with too few of them."""
-        main, edges = looks[0], len(self._parts)
+    def _look(self, of: Measurement) -> Look:
+        return Look(of, perturbation_between(self._ref_T, of.prediction.cam_T_grip), self._columns(of))
+
+    def _seen(self, frame: Frame, looks: list[Look], fit: int) -> Seen | None:
+        """The frame's edges, of several looks at it, of which that of the ``fit`` is named; None with too few of them.
+        """
+        main, edges = looks[0].of, len(self._parts)
         assert isinstance(frame.image, np.ndarray)
         noise = main.candidates.noise / math.sqrt(3.0)  # of three pixels
         beside = _beside(frame.image, main, self._parts)
-        away = [perturbation_between(self._ref_T, look.prediction.cam_T_grip) for look in looks]
         found = [
-            found_at(look, self._columns(look), at, self._reported_m(frame), self._frames, self._parts)
-            for look, at in zip(looks, away, strict=True)
+            found_at(look.of, look.columns, look.away, self._reported_m(frame), self._frames, self._parts)
+            for look in looks
         ]
-        by = next(k for k, look in enumerate(looks) if look is fit)
-        all_lines = [merged([of[edge] for of in found], by) for edge in range(edges)]
+        all_lines = [merged([of[edge] for of in found], fit) for edge in range(edges)]
         most = max(1, max(len(of) for of, _ in all_lines))
         rows, (white, image_white) = np.zeros((edges, most, 2, SIZE)), np.ones((2, edges, most, 2))
         lines, searched, image = np.zeros((3, edges, most, 2))
@@ -199,12 +213,6 @@ class Shadow:
         centre = np.array([camera.cx_px, camera.cy_px])
         out[:, FOCAL] = np.einsum("ni,ni->n", p.normal, p.uv_px - centre)
         return out
-
-
-def _near(look: Measurement, cam_T_grip: Array) -> bool:
-    """Whether a place's edges were all well within the search lines of a look."""
-    there = look.prediction
-    return there.moved_px(perturbation_between(there.cam_T_grip, cam_T_grip)) < LOOKED_PX
 
 
 def doubts_of(gripper: Gripper, along: Flags, ends_of: list[Flags], edge: Ints) -> list[Doubt]:
