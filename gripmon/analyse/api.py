@@ -4,7 +4,6 @@ them.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from gripmon.analyse.build import AnalysedRecording, build
 from gripmon.analyse.content import Report
 from gripmon.analyse.corrected import CorrectedRun, correct_table, name_of, write
 from gripmon.analyse.correction import STAGES
+from gripmon.model.csv_rows import csv_rows
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import to_json
 from gripmon.record.read import Collection, needed_recordings
@@ -31,6 +31,7 @@ Bar = Callable[[int, str], AbstractContextManager[Callable[[], None]]]
 """Number of steps and their unit -> a context manager that gives the function to call after each step."""
 
 _SUFFIXES = (".jsonl", ".parquet", ".rrd")
+_STAMPS = "a first line with the columns' names, capture times in Unix ns"
 
 
 @dataclass(frozen=True)
@@ -148,27 +149,14 @@ def _stamps(path: Path) -> NDArray[np.int64]:
     """The column ``stamp_ns`` of a CSV file."""
     stamps = []
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
-            names = [*(rows.fieldnames or ())]
-            if names.count("stamp_ns") != 1:
-                right = "a first line with the columns' names, capture times in Unix ns"
-                has = "several columns" if names.count("stamp_ns") else "no column"
-                raise InputError(f"{path}: has {has} stamp_ns; {right}", "stamps")
-            for row in rows:
-                if None in row or None in row.values():
-                    count = len(names) + (len(row[None]) if None in row else -list(row.values()).count(None))
-                    wrong = f"line {rows.line_num} has {count} values; {len(names)}, as the first line"
-                    raise InputError(f"{path}: {wrong}", "stamps")
-                try:
-                    stamps.append(np.int64(int(row["stamp_ns"] or "")))
-                except (ValueError, OverflowError):
-                    wrong = f"line {rows.line_num}: '{row['stamp_ns']}' is not a capture time"
-                    raise InputError(f"{path}: {wrong}; a whole number, Unix ns", "stamps") from None
-    except (OSError, UnicodeError, csv.Error) as error:
-        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})", "stamps") from None
-    if not stamps:
-        raise InputError(f"{path}: holds no capture times; a line for each", "stamps")
+        for place, row in csv_rows(path, _STAMPS, "capture times", ("stamp_ns",)):
+            try:
+                stamps.append(np.int64(int(row["stamp_ns"])))
+            except (ValueError, OverflowError):
+                wrong = f"{path}: {place}: '{row['stamp_ns']}' is not a capture time"
+                raise InputError(f"{wrong}; a whole number, Unix ns") from None
+    except InputError as error:
+        raise InputError(str(error), "stamps") from None
     return np.array(stamps, np.int64)
 
 

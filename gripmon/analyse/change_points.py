@@ -76,12 +76,12 @@ def find(run: Run) -> tuple[list[FoundChange], list[FoundChange]]:
     places = sorted((_place(y, peak) for peak in peaks.tolist()), key=lambda place: place.index)
     found: list[FoundChange] = []
     undecided: list[FoundChange] = []
-    before = -SIDE_FRAMES
+    before, largest = -SIDE_FRAMES, largest_background_change(run)
     for place in places:
         if place.index - before < SIDE_FRAMES:
             continue
         change = FoundChange(*good[[place.index, place.first, place.last]].tolist())
-        if float((_jump(y, place.index) ** 2).sum()) > largest_background_change(run):
+        if float((_jump(y, place.index) ** 2).sum()) > largest:
             found.append(change)
             before = place.index
         else:

@@ -98,7 +98,8 @@ def correct(
     if undecided:
         # Neither is preferred: the pose changed in all of them, or in none.
         other = _Fit(run, sorted([*kept, *undecided], key=lambda change: change.index), fit.swing)
-        spread += 0.5 * (other.x - fit.x)[:, :, None] * (other.x - fit.x)[:, None, :]
+        away = other.x - fit.x
+        spread += 0.5 * away[:, :, None] * away[:, None, :]
     source[outliers] = DISBELIEVED
     points = [_point(fit, k, stamp_ns) for k in range(len(kept))]
     vectors = x @ run.root.T

@@ -139,27 +139,23 @@ def number_text(value: float) -> str:
     return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else text
 
 
-def read_mapping(file: str, data: bytes, right: str) -> dict[str, Any]:
-    """The mapping in a file's bytes, as YAML; ``right`` says what kind of file it should be."""
-    value = _as_yaml(file, text_of(file, data, right), right)
+def read_mapping(file: str, text: str, right: str) -> dict[str, Any]:
+    """The mapping in a file's text, as YAML; ``right`` says what kind of file it should be."""
+    value = _as_yaml(file, text, right)
     if not isinstance(value, dict):
         raise InterchangeError(file, "", "is empty" if value is None else "holds no keys", right)
     return value
-
-
-def text_of(file: str, data: bytes, right: str) -> str:
-    """A file's bytes as text."""
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InterchangeError(file, "", f"is not text (byte {error.start} is not UTF-8)", right) from None
 
 
 class Document:
     """A file of another program; ``right`` says which may be read."""
 
     def __init__(self, file: str, data: bytes, right: str) -> None:
-        self.file, self.text, self._right = file, text_of(file, data, right).replace("\r\n", "\n"), right
+        self.file, self._right = file, right
+        try:
+            self.text = data.decode("utf-8-sig").replace("\r\n", "\n")
+        except UnicodeDecodeError as error:
+            raise InterchangeError(file, "", f"is not text (byte {error.start} is not UTF-8)", right) from None
 
     @functools.cached_property
     def content(self) -> dict[str, Any]:

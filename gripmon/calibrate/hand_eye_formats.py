@@ -16,13 +16,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gripmon.calibrate.foreign import Document, FileValues, InterchangeError, shown
-from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array
 
 _ANGLES, _QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
 READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
-UNIT_TOLERANCE = 0.01
-"""Largest difference of a quaternion's length from 1: files of four digits are rounded."""
 BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up) instead of a camera's (z forward)"
 _FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
@@ -380,12 +378,8 @@ def _published_pose(values: FileValues) -> Array:
 
 def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation (3, 3) by angles (rad) about fixed x, y, z, as in URDF."""
-    out = np.eye(3)
-    for axis, angle in enumerate((roll, pitch, yaw)):
-        half = [0.0, 0.0, 0.0]
-        half[axis] = np.sin(0.5 * angle)
-        out = rotation_from_xyzw((*half, np.cos(0.5 * angle))) @ out
-    return out
+    x, y, z = (exp_rotation(angle * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True))
+    return z @ y @ x
 
 
 def _pose(values: FileValues, shift: Sequence[float], quaternion: Sequence[float]) -> Array:

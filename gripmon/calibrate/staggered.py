@@ -25,7 +25,7 @@ def places_of(cells: NDArray[np.intp], target: StaggeredCircles) -> NDArray[np.i
     """Steps (n, 2) along the target's x and y of the discs at cells (n, 2) of its lattice; None if these cells are no
     part of it.  Of several places the first: a part of the target may be anywhere on it.
     """
-    there = np.zeros(np.array(target.places).max(axis=0) + 1, bool)
+    there = np.zeros(np.array(target.last) + 1, bool)
     there[tuple(np.array(target.places).T)] = True
     for _ in range(4):
         cells = np.stack([-cells[:, 1], cells[:, 0]], axis=1)

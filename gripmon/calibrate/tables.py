@@ -4,7 +4,6 @@ of them, from columns or from the named images.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -18,8 +17,9 @@ from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
 from gripmon.calibrate.foreign import as_number, read_mapping
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.model.csv_rows import csv_rows, read_text
 from gripmon.model.errors import InputError, input_errors
-from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, make_transform, rotation_from_xyzw
 from gripmon.model.images import check_size, image_in
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.records import Array, Image
@@ -35,7 +35,6 @@ POSE_COLUMNS = (
     f"{', '.join(POSITION)} with {', '.join(QUATERNION)} (quaternion) or {', '.join(ROTATION_VECTOR)} (rotation "
     "vector), or m00 … m33 (4 x 4, row by row)"
 )
-_UNIT = 1e-2
 _ORTHONORMAL = 1e-3
 _TABLE = "a table of samples"
 _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
@@ -49,53 +48,19 @@ def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
         raise InputError(f"{path}: is not a table; a .csv, .yaml or .json file")
     if suffix == ".csv":
-        return _csv_rows(path, right)
+        places, rows = zip(*csv_rows(path, right), strict=True)
+        return [*rows], [*places]
     if suffix == ".json":
         try:
-            values = json.loads(_text(path, right))
+            values = json.loads(read_text(path, right))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not JSON: {error}; a JSON file") from None
     else:
-        values = read_mapping(str(path), _text(path, right).encode(), _SAMPLES)
+        values = read_mapping(str(path), read_text(path, right), _SAMPLES)
     samples = values.get("samples") if isinstance(values, dict) else values
     if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
         raise InputError(f"{path}: samples is not a list of samples; {_SAMPLES}")
     return samples, [f"sample {k + 1}" for k in range(len(samples))]
-
-
-def _csv_rows(path: Path, right: str) -> tuple[list[dict[str, Any]], list[str]]:
-    reader = csv.DictReader(_text(path, right).splitlines(), skipinitialspace=True)
-    rows: list[dict[str, Any]] = []
-    places = []
-    try:
-        header = reader.fieldnames or []
-        separator = next((sign for sign in ";\t" if len(header) == 1 and sign in header[0]), None)
-        if separator is not None:
-            shown = {";": "semicolons", "\t": "tabs"}[separator]
-            raise InputError(f"{path}: columns are separated by {shown}; commas, and points in numbers")
-        for row in reader:
-            if None in row or None in row.values():
-                raise InputError(
-                    f"{path}: line {reader.line_num} has another number of fields than the header; {len(header)}"
-                )
-            rows.append({str(key).strip(): value.strip() for key, value in row.items()})
-            places.append(f"line {reader.line_num}")
-    except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {right}") from None
-    if not rows:
-        raise InputError(f"{path}: holds no row; a header line, then a line for each")
-    return rows, places
-
-
-def _text(path: Path, right: str) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; {right}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not text; {right}") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); {right}") from None
 
 
 def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:
@@ -157,7 +122,7 @@ def _list(value: Any, count: int, what: str) -> list[float]:
 
 def _from_quaternion(quaternion: Sequence[float], place: str) -> Array:
     length = math.sqrt(sum(q * q for q in quaternion))
-    if abs(length - 1.0) > _UNIT:
+    if abs(length - 1.0) > UNIT_TOLERANCE:
         hint = " (degrees?)" if max(abs(q) for q in quaternion) > 1.5 else ""
         raise ValueError(
             f"{place}: the quaternion {_shown(quaternion)} has the length {length:.4g}{hint}; a unit quaternion x y z w"

@@ -89,7 +89,7 @@ def size_mm(target: Target) -> tuple[float, float]:
     """Width and height of the printed pattern (mm)."""
     if isinstance(target, CircleGrid):
         step, disc = 1e3 * target.step_m, 1e3 * target.diameter_m
-        right, below = (max(each) for each in zip(*target.places, strict=True))
+        right, below = target.last
         return right * step + disc, below * step + disc
     more = 0 if isinstance(target, Charuco) else 1
     return (target.columns + more) * 1e3 * target.square_m, (target.rows + more) * 1e3 * target.square_m

@@ -37,6 +37,7 @@ def import_calibration(
     if hand_eye is not None:
         if size_px is not None or model is not None:
             raise InputError(f"{path}: is a hand/eye transform ({hand_eye.kind}); without --size and --model")
+        values = reference_values(hand_eye)
         origin = f"{hand_eye.kind}: {hand_eye.gripper_frame} to {hand_eye.camera_frame}"
         notes = [f"{origin}, from {path.name}, SHA-256 {made.inputs[0].sha256}", f"written {made.time}: {made.command}"]
         x, y, z = (1e3 * invert(hand_eye.grip_T_cam)[:3, 3]).tolist()
@@ -45,10 +46,10 @@ def import_calibration(
             tcp = f"if the TCP isn't at {hand_eye.gripper_frame} (x across the jaws, z out): flange_T_tcp in this file"
             notes, lines = [*notes, tcp], [*lines, tcp]
         else:
-            robot_reference(path, reference_values(hand_eye))  # whole: nothing is to be completed
+            robot_reference(path, values)  # whole: nothing is to be completed
         if hand_eye.doubt:
             notes, lines = [*notes, hand_eye.doubt], [*lines, f"warning: {hand_eye.doubt}"]
-        text = "".join(f"# {note}\n" for note in notes) + as_yaml(reference_values(hand_eye), inline=True)
+        text = "".join(f"# {note}\n" for note in notes) + as_yaml(values, inline=True)
         return text.encode(), lines
     found = read_foreign_camera(data, str(path), which=which, size_px=size_px, model=model)
     camera, lens = found.camera, found.camera.__struct_config__.tag

@@ -89,14 +89,14 @@ class MetricsServer(Output):
         self._state: StateRecord | None = None
         self._record: FrameRecord | None = None
 
-        def made(kind: type[Any], name: str, **more: Any) -> Any:
-            _, labels, text = OTHER_METRICS[name]
-            return kind(name, text, (*_WHO, *labels), registry=registry, **more)
+        def made(name: str, **more: Any) -> Any:
+            kind, labels, text = OTHER_METRICS[name]
+            return getattr(prometheus, kind.capitalize())(name, text, (*_WHO, *labels), registry=registry, **more)
 
-        self._latency = made(prometheus.Histogram, "gripmon_latency_seconds", buckets=LATENCY_BOUNDS_S).labels(*who)
-        verdicts = made(prometheus.Counter, "gripmon_verdicts_total")
+        self._latency = made("gripmon_latency_seconds", buckets=LATENCY_BOUNDS_S).labels(*who)
+        verdicts = made("gripmon_verdicts_total")
         self._verdicts = {verdict: verdicts.labels(*who, verdict.value) for verdict in Verdict}
-        self._alerts = made(prometheus.Counter, "gripmon_alerts_total")
+        self._alerts = made("gripmon_alerts_total")
         prometheus.ProcessCollector(registry=registry)
         registry.register(self)
         try:
@@ -148,10 +148,7 @@ class MetricsServer(Output):
 
 
 class StateMetric(NamedTuple):
-    """A metric of the state message: its samples by the values of ``labels``, none where the value is unknown.
-
-    A counter is exposed with ``_total`` behind its name.
-    """
+    """A metric of the state message: its samples by the values of ``labels``, none where the value is unknown."""
 
     name: str
     kind: Literal["counter", "gauge"]
@@ -191,7 +188,7 @@ def _metric_of(field: Field) -> StateMetric | None:
     if not isinstance(kind, kinds.IntType | kinds.FloatType | kinds.BoolType) or field.name in _NO_METRIC:
         return None
     counts = isinstance(kind, kinds.IntType) and field.name not in _GAUGES
-    return StateMetric(name, "counter" if counts else "gauge", text, (), lambda state: (
+    return StateMetric(name + "_total" * counts, "counter" if counts else "gauge", text, (), lambda state: (
         {} if value(state) is None else {(): scale * value(state)}
     ))  # fmt: skip
 

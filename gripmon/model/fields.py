@@ -6,7 +6,7 @@ Parquet's columns, Prometheus's metrics and the reference page follow from it.
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import msgspec.inspect as kinds
@@ -34,14 +34,9 @@ class Field(NamedTuple):
 @functools.cache
 def fields_of(message: type[msgspec.Struct]) -> dict[str, Field]:
     """A message's fields by name, in their order."""
-    return {name: _field(name, kind) for name, kind in types_of(message).items()}
-
-
-def types_of(message: type[msgspec.Struct]) -> dict[str, kinds.Type]:
-    """The types of a message's fields, by name."""
     found = kinds.type_info(message)
     assert isinstance(found, kinds.StructType)
-    return {field.name: field.type for field in found.fields}
+    return {field.name: _field(field.name, field.type) for field in found.fields}
 
 
 def plain(kind: kinds.Type) -> kinds.Type:
@@ -53,12 +48,20 @@ def plain(kind: kinds.Type) -> kinds.Type:
     return kind
 
 
-def _field(name: str, kind: Any) -> Field:
-    told = (kind.extra_json_schema or {}).get("description", "") if isinstance(kind, kinds.Metadata) else ""
+def described(kind: kinds.Type) -> str:
+    """A type's description; ``float | None`` may hold it below the union."""
+    if isinstance(kind, kinds.Metadata):
+        return (kind.extra_json_schema or {}).get("description", "") or described(kind.type)
+    if isinstance(kind, kinds.UnionType):
+        return next((text for each in kind.types if (text := described(each))), "")
+    return ""
+
+
+def _field(name: str, kind: kinds.Type) -> Field:
     bare = plain(kind)
     counts = isinstance(bare, kinds.IntType | kinds.FloatType | kinds.TupleType | kinds.VarTupleType)
     unit = next((unit for suffix, unit in _UNITS if name.endswith(suffix)), "1" if counts else "")
-    return Field(name, unit, told or _first_line(bare), bare)
+    return Field(name, unit, described(kind) or _first_line(bare), bare)
 
 
 def _first_line(kind: kinds.Type) -> str:

@@ -14,6 +14,8 @@ import numpy as np
 from gripmon.model.records import Array, Transform
 
 SMALL_RAD = 1e-8
+UNIT_TOLERANCE = 0.01
+"""Largest difference of a written quaternion's length from 1: files of four digits are rounded."""
 _IDENTITY = np.eye(4)
 _THREE_HALVES = 1.5 * np.eye(3)
 

@@ -68,11 +68,15 @@ class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_fi
     spacing_m: _Length
     diameter_m: _Length
 
-
     @property
     def places(self) -> list[tuple[int, int]]:
         """Steps along x and y of every disc from the first, row by row."""
         return [(column, row) for row in range(self.rows) for column in range(self.columns)]
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps to the outermost discs along x and along y."""
+        return self.columns - 1, self.rows - 1
 
     @property
     def step_m(self) -> float:
@@ -89,6 +93,11 @@ class StaggeredCircles(CircleGrid, frozen=True, forbid_unknown_fields=True, tag_
     def places(self) -> list[tuple[int, int]]:
         """Steps along x and y of every disc from the first, row by row."""
         return [(2 * column + row % 2, row) for row in range(self.rows) for column in range(self.columns)]
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps to the outermost discs along x and along y."""
+        return 2 * self.columns - 1, self.rows - 1
 
     @property
     def step_m(self) -> float:

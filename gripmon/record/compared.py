@@ -22,10 +22,11 @@ from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
 from gripmon.record.written_file import WrittenFile, open_stream
 
 RECORDED, REPLAYED = "recorded", "replayed"
+_ROOT = f"{RECORDED}/"
 _BATCH_ROWS = 32
 _LOOKS = (
     (REPLAYED, "", 255, 1.5),
-    (RECORDED, f"{RECORDED}/", 110, 5.0),
+    (RECORDED, _ROOT, 110, 5.0),
 )  # run, root of its paths, opacity, width of its lines
 
 _TRACK = "rig/corrected"
@@ -47,10 +48,10 @@ class ComparedRecorder(Recorder):
         """
         path.unlink(missing_ok=True)
         self._source, self._recorded_limits = source, recorded_limits
-        stream, layout = open_stream(scene), layout_of_both(scene, f"{RECORDED}/", REPLAYED, RECORDED)
+        stream, layout = open_stream(scene), layout_of_both(scene, RECORDED, REPLAYED)
         self._file = WrittenFile(path, stream, scene, 1, layout_file(layout), contextlib.nullcontext)
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
-        send = Sender(stream, f"{RECORDED}/")
+        send = Sender(stream, _ROOT)
         self._curves, self._status = CurveWriter(send, self._file.writer.corner_ids), EventWriter(send, RECORDED)
         _name_both(stream)
         self._rows: list[Row] = []
@@ -83,6 +84,7 @@ class ComparedRecorder(Recorder):
             if self.failure is None:
                 self._curves.finish()
                 self._file.finish()
+        with self._failing():
             self._file.close()
 
     def _write(self) -> None:

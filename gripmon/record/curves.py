@@ -164,8 +164,9 @@ _LOOKS = {
 
 
 def curve_path(column: Column) -> str:
-    """The entity of a column's curve; empty if it has none."""
-    return "" if column.curve is None else f"{column.curve[0]}{_DRAWN[column.unit][0]}"
+    """The entity of a column's curve."""
+    assert column.curve is not None
+    return f"{column.curve[0]}{_DRAWN[column.unit][0]}"
 
 
 def _of_column(column: Column) -> Curve:

@@ -73,10 +73,12 @@ def _details(scene: Scene) -> rrb.Tabs:
     )
 
 
-def layout_of_both(scene: Scene, root: str, replayed: str, recorded: str) -> rrb.Blueprint:
-    """Of a run and its replay; the recorded one is below ``root``.  Left: the image with the replay's overlay, and the
+def layout_of_both(scene: Scene, recorded: str, replayed: str) -> rrb.Blueprint:
+    """Of a run and its replay; the recorded one is below its name.  Left: the image with the replay's overlay, and the
     events of both.  Right: drifts and limits of both in one plot, and the states of both.
     """
+
+    root = f"{recorded}/"
 
     def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
         return plot("/", [f"{where}{path}" for where in (root, "") for path in paths], name, legend=False)

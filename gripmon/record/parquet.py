@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.model.fields import Field, fields_of, plain, types_of
+from gripmon.model.fields import Field, fields_of, plain
 from gripmon.model.lerobot_columns import POSE_NAMES
 from gripmon.model.records import AlertRecord, RecordedCommand, ReferenceRecord, StateRecord
 from gripmon.model.records.references import ReferenceInputs
@@ -45,9 +45,7 @@ def _field(name: str, kind: pa.DataType, unit: str, text: str) -> pa.Field:
 
 def _pose_fields(name: str, text: str) -> list[pa.Field]:
     units = ("m",) * 3 + ("1",) * 4
-    return [
-        _field(f"{name}_{part}", pa.float64(), unit, text) for part, unit in zip(POSE_NAMES, units, strict=True)
-    ]
+    return [_field(f"{name}_{part}", pa.float64(), unit, text) for part, unit in zip(POSE_NAMES, units, strict=True)]
 
 
 def _axis_fields(name: str, text: str) -> list[pa.Field]:
@@ -85,7 +83,7 @@ def _arrow(kind: kinds.Type) -> pa.DataType:
     if isinstance(kind, kinds.VarTupleType):
         return pa.list_(_arrow(kind.item_type))
     if isinstance(kind, kinds.StructType):
-        return pa.struct([(name, _arrow(of)) for name, of in types_of(kind.cls).items()])
+        return pa.struct([(field.name, _arrow(field.type)) for field in kind.fields])
     return _PLAIN.get(type(kind), pa.string())
 
 
@@ -187,9 +185,7 @@ def _fields(columns: Iterable[_Columns]) -> list[pa.Field]:
 _FRAMES = tuple(_frame_columns())
 _MESSAGES = {table: _of_message(*of) for table, of in _DATED.items()}
 _OF_REFERENCE = [_of_message(ReferenceRecord, names) for names in _REFERENCE]
-_OF_INPUTS = {
-    name: _of_field(fields_of(ReferenceInputs)[name]._replace(name=named)) for name, named in _INPUTS.items()
-}
+_OF_INPUTS = {name: _of_field(fields_of(ReferenceInputs)[name]._replace(name=named)) for name, named in _INPUTS.items()}
 
 SCHEMAS: dict[str, pa.Schema] = {
     "frames": _schema("frames", [*_fields(_FRAMES), *_RUN]),

@@ -106,16 +106,15 @@ class Worker:
             self.still_writes = self._reports.poll(_BEAT_WAIT_S)
             self.look()
             self.still_writes &= not self.gone
-        if self.still_writes:
-            self._process.leave()
-        return None if self.still_writes else self.reap()
+        if not self.still_writes:
+            return self.reap()
+        self._process.leave()
+        return None
 
     def reap(self) -> str | None:
         """Wait for the end of a process that is :attr:`gone`, kill any other, and close everything."""
         failure = None
-        if self.gone:
-            self._process.ended_within(_KILL_WAIT_S)
-        if self._process.runs:
+        if not self._process.ended_within(_KILL_WAIT_S if self.gone else 0.0):
             failure = "the recording process did not finish in time; the end of its last file may be missing"
             self.kill()
         for pipe in (self._batches, self._reports):

@@ -122,7 +122,7 @@ class Plate:
     def _print(self, grid: _Grid) -> Array:
         look, target, step = self.print, self.target, _spacing_m(self.target)
         if isinstance(target, CircleGrid):
-            right, below = (max(each) for each in zip(*target.places, strict=True))
+            right, below = target.last
             dark, low, high = _discs(target, look.errors_m, grid), -0.5, (right + 0.5, below + 0.5)
         else:
             printed = grid if look.errors_m is None else grid.moved(*_shift(target, look.errors_m, grid))

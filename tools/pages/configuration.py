@@ -11,6 +11,8 @@ import msgspec
 from msgspec import inspect as mi
 
 from gripmon.daemon.config.settings import Settings
+from gripmon.model.fields import described
+from pages import cell
 
 UNITS = {
     "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s",
@@ -95,23 +97,13 @@ def _is_section(node: mi.Type) -> bool:
 
 
 def _key(dotted: str, field: mi.Field) -> Key:
-    meaning = _description(field.type)
+    meaning = described(field.type)
     name = dotted.rpartition(".")[2]
     unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
     found = re.search(r" \((no unit|number|[\w/²√]+(?: per [^()]*)?)\)$", meaning)
     if found:
         unit, meaning = (unit or found[1]).replace("no unit", "").replace("number", ""), meaning[: found.start()]
-    meaning = meaning.replace("|", "\\|").replace("<", "&lt;")
-    return Key(dotted, _type(field.type), unit, _default(field), _bounds(field.type), meaning)
-
-
-def _description(node: mi.Type) -> str:
-    """Also that of an alternative; ``float | None`` holds it below the union."""
-    if isinstance(node, mi.Metadata):
-        return (node.extra_json_schema or {}).get("description", "") or _description(node.type)
-    if isinstance(node, mi.UnionType):
-        return next((text for each in node.types if (text := _description(each))), "")
-    return ""
+    return Key(dotted, _type(field.type), unit, _default(field), _bounds(field.type), cell(meaning))
 
 
 def _type(node: mi.Type) -> str:

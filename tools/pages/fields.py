@@ -8,6 +8,7 @@ from gripmon.io.metrics import OTHER_METRICS, state_metrics
 from gripmon.record.curves import curve_path
 from gripmon.record.parquet import SCHEMAS
 from gripmon.record.table import COLUMNS
+from pages import cell
 
 _ROWS = {
     "frames": "frame",
@@ -47,9 +48,9 @@ def page() -> str:
 
 def metrics() -> list[tuple[str, str, tuple[str, ...], str]]:
     """Name as exposed, type, labels and meaning of each metric."""
-    found = [(m.name + "_total" * (m.kind == "counter"), m.kind, m.labels, m.help) for m in state_metrics()]
+    found = [(m.name, m.kind, m.labels, m.help) for m in state_metrics()]
     return found + [(name, kind, labels, text) for name, (kind, labels, text) in OTHER_METRICS.items()]
 
 
 def _row(*cells: str) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    return f"| {' | '.join(cell(each) for each in cells)} |"

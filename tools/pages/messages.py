@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 from gripmon.model.records import MESSAGES, json_schema
+from pages import cell
 
 
 def put_into(page: str) -> str:
@@ -75,4 +76,4 @@ def _meaning(node: dict[str, Any]) -> str:
     texts += [part["description"] for part in node.get("anyOf", ()) if "description" in part]
     if not texts and "$ref" in node:
         texts = [json_schema()["$defs"][node["$ref"].rpartition("/")[2]]["description"].split("\n")[0]]
-    return ". ".join(dict.fromkeys(text.rstrip(".") for text in texts)).replace("|", "\\|").replace("<", "&lt;")
+    return cell(". ".join(dict.fromkeys(text.rstrip(".") for text in texts)))

@@ -31,7 +31,7 @@ from gripmon.io.sources import (
 from gripmon.io.sources.live import backend_number
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw, to_record
+from gripmon.model.geometry import UNIT_TOLERANCE, invert, make_transform, rotation_from_xyzw, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord, Transform, ValidBy, to_json
 from gripmon.monitor import MonitorSettings
@@ -42,7 +42,6 @@ NEAREST_M = 0.005
 FARTHEST_M = 5.0
 """Range of the TCP's depth and distance in front of the camera: beyond it, another unit was meant."""
 FEWEST_CORNERS_IN_VIEW = 3
-_UNIT_TOLERANCE = 0.01
 
 _IN_FRONT = (
     "z > 0 in front of the camera: cam_T_grip maps gripper coordinates to camera coordinates (the inverse was given?)"
@@ -71,7 +70,7 @@ def reference_transform(settings: ReferenceSettings) -> Array:
     """``cam_T_grip`` (4, 4) of a reference.  Raises :class:`SettingsError` if it is invalid."""
     x, y, z, w = settings.cam_T_grip.rotation_xyzw
     length = math.sqrt(x * x + y * y + z * z + w * w)
-    if abs(length - 1.0) > _UNIT_TOLERANCE:
+    if abs(length - 1.0) > UNIT_TOLERANCE:
         right = "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
         raise SettingsError(Fault("reference.cam_T_grip.rotation_xyzw", f"has length {length:.4g}", right))
     translation_m = np.array(settings.cam_T_grip.translation_m)

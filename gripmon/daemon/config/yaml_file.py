@@ -10,6 +10,7 @@ import msgspec
 
 import gripmon
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
+from gripmon.model.fields import described
 from gripmon.model.yaml_text import YamlFault, parse_yaml, yaml_value
 
 _T = TypeVar("_T")
@@ -162,7 +163,7 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
             lines.append(_line(indent, field.encode_name, "", "", off))
             lines.append(lines_of(value, indent + 2, off=off))
             continue
-        description = _described(field.type)
+        description = described(field.type)
         lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
     return "\n".join(lines)
 
@@ -170,12 +171,3 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
 def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:
     text = f"{'# ' * off}{' ' * indent}{key}:{f' {value}' if value else ''}"
     return f"{text}  # {description}" if description else text
-
-
-def _described(node: Any) -> str:
-    if isinstance(node, msgspec.inspect.Metadata):
-        own = (node.extra_json_schema or {}).get("description", "")
-        return own or _described(node.type)
-    if isinstance(node, msgspec.inspect.UnionType):
-        return next((text for each in node.types if (text := _described(each))), "")
-    return ""
