@@ -19,6 +19,7 @@ from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
 from gripmon.monitor.ends_told import EndsTold
+from gripmon.monitor.lighting import Lighting
 from gripmon.monitor.shadow import Look, Shadow, _alike, _texture
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import Scenario
@@ -131,6 +132,48 @@ def test_a_background_that_creeps_is_another_one_in_the_end() -> None:
         likes = [shadow._compare(0, np.array([p, p]) + rng.normal(0.0, 0.3, (2, 12)), 0.3) for p in pictures]
         assert likes[0] == 0.0
         assert least <= np.prod(likes[1:]) <= most
+
+
+def test_a_light_is_left_as_far_as_the_fingers_are_as_bright() -> None:
+    """By noise nothing changes; what changes slowly has changed as much in the end; a stop leaves exp(-1/2)."""
+    rng = np.random.default_rng(6)
+    grey = rng.uniform(40.0, 160.0, (10, 1)) + rng.normal(0.0, 3.0, (10, 12))
+
+    def left(*gains: float) -> float:
+        lighting = Lighting()
+        return float(np.prod([lighting.kept(g * grey + rng.normal(0.0, 1.0, grey.shape), 1.0) for g in gains]))
+
+    assert left(*[1.0] * 30) > 0.999
+    assert left(1.0, 2.0) == pytest.approx(np.exp(-0.5), abs=0.01)
+    assert left(*np.linspace(1.0, 2.0, 30)) == pytest.approx(left(1.0, 2.0), abs=0.01)
+    assert left(1.0, 4.0, 1.0) < 0.1
+    unseen = grey.copy()
+    unseen[3] = np.nan
+    lighting = Lighting()
+    assert [lighting.kept(of, 1.0) for of in (unseen, grey, grey)] == [1.0, 1.0, 1.0]
+
+
+def test_the_light_is_looked_at_on_the_fingers_and_the_belief_is_told() -> None:
+    """The fingers half as bright: what was learnt of the light is partly forgotten; the background alone: nothing."""
+    image, opening_m = picture(nominal_cam_T_grip())
+    pose, reference = nominal_cam_T_grip(), reference_of(nominal_cam_T_grip())
+    monitor = Monitor(make_camera(PAPER_LENS), sharp_gripper(), MonitorSettings(), reference)
+    measure = monitor._tracker.measure
+    of_fingers = measure(Frame(seq=0, stamp_ns=0, image=image, jaw_opening_m=opening_m), pose, 0.0).prediction.uv_px
+    fingers = np.zeros(image.shape[:2], np.uint8)
+    middle = 0.5 * (of_fingers[:, 0].min() + of_fingers[:, 0].max())
+    for side in (of_fingers[:, 0] < middle, of_fingers[:, 0] >= middle):
+        cv2.fillConvexPoly(fingers, cv2.convexHull(np.round(of_fingers[side]).astype(np.int32)), 1)
+    kept, unsure = [], []
+    for gain, where in ((1.0, fingers), (0.5, fingers), (0.8, 1 - fingers)):
+        shadow = Shadow(monitor._camera, sharp_gripper(), monitor._tracker, reference, MonitorSettings())
+        for k, of in enumerate([image] * 4 + [np.where(where > 0, gain * image, image).astype(np.uint8)]):
+            frame = Frame(seq=k, stamp_ns=0, image=of, jaw_opening_m=opening_m)
+            shadow.see(frame, measure(frame, pose, 0.0), k * FRAME_S)
+        kept.append(shadow._light_kept)
+        unsure.append(shadow._belief.moments[1][LIGHT, LIGHT])
+    assert kept == pytest.approx([1.0, np.exp(-0.5), 1.0], abs=0.05)
+    assert unsure[1] > 2.0 * unsure[0] and unsure[2] == pytest.approx(unsure[0], rel=0.2)
 
 
 def test_texture_is_the_scatter_without_noise_and_shading() -> None:

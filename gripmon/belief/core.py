@@ -22,7 +22,7 @@ from gripmon.belief.jumps import Jumps
 from gripmon.belief.keep import keep, remember, same_place
 from gripmon.belief.nodes import Nodes, prepare
 from gripmon.belief.rows import add_noise, fade, move
-from gripmon.belief.search import AT_ONCE, Asked, Candidates, put, put_all, put_pairs, search, take_one_of
+from gripmon.belief.search import AT_ONCE, Asked, Candidates, known, put, put_all, put_pairs, search, take_one_of
 from gripmon.belief.state import (
     LATELY_S,
     LEAST_LIGHT_MEMORY,
@@ -231,9 +231,10 @@ class Belief:
         made = dict[tuple[int, int], int]()
         due = math.log(max(self.priors.unseen_knock, 1e-300))
         floor = float(candidates.log_weight[:n].max()) + math.log(self.least) - due + math.log(_OF_SIZES)
+        by_policy = dict[int, float]()
         for c in np.flatnonzero(candidates.log_weight[:n] > floor) if self._table.at_ends else ():
-            h, doubts = int(nodes.parent[candidates.node[c]]), int(candidates.doubts[c])
-            if self._is_weighed(int(c)) or nodes.jump[candidates.node[c]] >= 0 or sees[c]:
+            h, doubts, jump = self._parent(int(c)), int(candidates.doubts[c]), self._jump_of(int(c))
+            if sees[c] or (jump >= 0 and jumps.knock[jump]) or self._is_weighed(int(c)):
                 continue
             self._just_weighed[c] = True
             for j in np.flatnonzero(jumps.knock):
@@ -243,16 +244,26 @@ class Belief:
                     self._node(i, h, int(j), float(self._bank.log_weight[h]) + log, factor, asked)
                     made[h, int(j)], i = i, i + 1
                 m = put(candidates, n, nodes, made[h, int(j)], doubts, self._bank, asked)
-                if m > n:  # policy, whatever the ends that aren't trusted say of it
-                    candidates.log_weight[n] = max(candidates.log_weight[n], candidates.log_weight[c] + log)
-                else:
-                    self._just_weighed[c] = False
+                k = n if m > n else int(known(candidates, n, made[h, int(j)], doubts))
                 n = m
+                if k < 0:
+                    self._just_weighed[c] = False
+                    continue
+                # Policy, whatever the ends that aren't trusted say of it.
+                by_policy[k] = float(np.logaddexp(by_policy.get(k, -math.inf), candidates.log_weight[c] + log))
+        for k, log in by_policy.items():
+            candidates.log_weight[k] = max(candidates.log_weight[k], log)
         return n
+
+    def _parent(self, c: int) -> int:
+        return int(self._nodes.parent[self._candidates.node[c]])
+
+    def _jump_of(self, c: int) -> int:
+        return int(self._nodes.jump[self._candidates.node[c]])
 
     def _is_weighed(self, c: int) -> bool:
         """Whether a candidate's parent saw no end either, doubted the same ends, and a knock was weighed beside it."""
-        h = int(self._nodes.parent[self._candidates.node[c]])
+        h = self._parent(c)
         changed = int(self._bank.doubts[h]) ^ int(self._candidates.doubts[c])
         return bool(self._weighed[h]) and not changed & self._of_ends
 

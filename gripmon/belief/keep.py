@@ -20,6 +20,12 @@ REST = 10.0
 """What is left is dropped when all of it is less probable than this many of the lightest that are kept: a hundredth of
 the risk.
 """
+COMPARABLE = 3.0
+"""How many times heavier a hypothesis may be that another one becomes part of, by moments, wherever both are: of what
+the lighter one says beyond its own mean two thirds are left then.
+"""
+BEGINS = 5.0
+"""Nats by which doubts that a hypothesis loses would have to begin anew: once in 200 backgrounds."""
 
 
 @compiled
@@ -82,19 +88,18 @@ def keep(
     candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, near: float,
     most: int, least: float, merging: bool,
 ) -> tuple[Ints, int, float]:  # fmt: skip
-    """Write g, doubts and weights of the heaviest hypotheses ``into`` another bank, none lighter than ``least``, by
-    moments where two are the same (``merging``).  At most ``most`` go on, of one place a quarter of them: beyond these
-    what says the same of the place is one of them whatever it doubts, and what says something else is listed behind
-    them, for this frame's bound alone.  Which candidate gives each its rows (k,), how many are listed, and the
-    probability that is in none.
+    """Write g, doubts and weights of the hypotheses ``into`` another bank, the heaviest first, none lighter than
+    ``least``, by moments where two are the same (``merging``).  At most ``most`` go on: where there are more, those
+    become one that lose least by it, and what can't is listed behind them, for this frame's bound alone.  Which
+    candidate gives each its rows (k,), how many are listed, and the probability that is in none.
     """
     order = np.argsort(-candidates.log_weight[:n])
     top, total = candidates.log_weight[order[0]], 0.0
     for c in order:
         total += math.exp(candidates.log_weight[c] - top)
-    chosen, listed, lost = np.empty(min(most, n), np.int64), 0, 0.0
+    chosen, listed, lost, full = np.empty(min(most, n), np.int64), 0, 0.0, False
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
-    rest, there = 1.0, np.zeros(len(into.doubts), np.int64)  # how many say the place that one is the first to say
+    rest = 1.0
     for c in order:
         weight = math.exp(candidates.log_weight[c] - top) / total
         if weight < least or (merging and listed > 0 and rest < REST * least):
@@ -106,33 +111,84 @@ def keep(
             mean[j] = bank.mean[nodes.parent[i], j]
         doubted, held = edges_of(doubts, table.edges), edges_of(doubts & table.held, table.edges)
         posterior(nodes, i, seen, doubted, held, across(nodes, i, doubts), near, mean, covariance)
-        twin, first = -1, -1
+        twin = -1
         for q in range(listed if merging else 0):
-            alike = same_doubts(into.doubts[q], doubts, table)
-            if not alike and (first >= 0 or there[q] == 0):
-                continue
-            if same_place(into.mean[q], into.covariance[q], mean, covariance):
-                first = q if first < 0 and there[q] > 0 else first
-                if alike or listed >= most or there[first] >= most // 4:
-                    twin = q
-                    break
+            alike = listed > most or same_doubts(into.doubts[q], doubts, table)
+            if alike and same_place(into.mean[q], into.covariance[q], mean, covariance):
+                twin = q
+                break
         if twin >= 0:
             merge(into, twin, weight, mean, covariance)
-        elif listed < len(into.doubts):
-            if listed < most:
-                chosen[listed] = c
-            there[first if first >= 0 else listed] += 1
-            into.doubts[listed], into.log_weight[listed] = doubts, weight
-            for j in range(SIZE):
-                into.mean[listed, j] = mean[j]
-                for m in range(SIZE):
-                    into.covariance[listed, j, m] = covariance[j, m]
-            listed += 1
-        else:
+            continue
+        if merging and listed == most and not full:
+            listed = make_room(into, chosen, most, table)
+            full = listed == most
+        if listed == len(into.doubts):
             lost += weight
+            continue
+        if listed < most:
+            chosen[listed] = c
+        into.doubts[listed], into.log_weight[listed] = doubts, weight
+        into.mean[listed], into.covariance[listed] = mean, covariance
+        listed += 1
     for q in range(listed):
         into.log_weight[q] = math.log(into.log_weight[q] / (1.0 - lost))
     return chosen[:min(most, listed)], listed, lost
+
+
+@compiled
+def make_room(into: Bank, chosen: Ints, n: int, table: Table) -> int:
+    """Pairs of ``n`` hypotheses become one each, by moments, those first that lose least (Runnalls 2007, with the axes
+    of d and the opening apart), with what each would have to doubt anew: who says the same of the place, or is as
+    light.  Never more than an eighth at once.  The heavier of a pair gives its doubts and its candidate, in ``chosen``;
+    how many are left.
+    """
+    cost, partner = np.full(n, math.inf), np.full(n, -1)
+    for q in range(n):
+        weight = into.log_weight[q]
+        for other in range(n):
+            heavier = into.log_weight[other]
+            if other == q or heavier < weight or (heavier == weight and other > q):
+                continue
+            loss = loss_of(into, other, q)
+            loss += 0.0 if same_doubts(into.doubts[other], into.doubts[q], table) else BEGINS * weight
+            if loss < cost[q] and (
+                heavier <= COMPARABLE * weight
+                or same_place(into.mean[other], into.covariance[other], into.mean[q], into.covariance[q])
+            ):
+                cost[q], partner[q] = loss, other
+    taken, gone, left = np.zeros(n, np.bool_), np.zeros(n, np.bool_), n - max(n // 8, 1)
+    count = n
+    for q in np.argsort(cost):
+        other = partner[q]
+        if other < 0 or count == left:
+            break
+        if not (taken[q] or taken[other]):
+            taken[q] = taken[other] = gone[q] = True
+            merge(into, other, into.log_weight[q], into.mean[q], into.covariance[q])
+            count -= 1
+    count = 0
+    for q in range(n):
+        if not gone[q]:
+            chosen[count], into.doubts[count], into.log_weight[count] = chosen[q], into.doubts[q], into.log_weight[q]
+            into.mean[count], into.covariance[count] = into.mean[q], into.covariance[q]
+            count += 1
+    return count
+
+
+@compiled
+def loss_of(into: Bank, heavier: int, q: int) -> float:
+    """At most so much of the Kullback-Leibler divergence is lost when ``q`` becomes part of a heavier hypothesis;
+    ``log_weight`` holds the weights themselves meanwhile.
+    """
+    together, loss = into.log_weight[heavier] + into.log_weight[q], 0.0
+    share = into.log_weight[q] / together
+    for j in (0, 1, 2, 3, 4, 5, OPENING):
+        a, b = into.covariance[heavier, j, j], into.covariance[q, j, j]
+        away = into.mean[q, j] - into.mean[heavier, j]
+        both = (1.0 - share) * a + share * b + share * (1.0 - share) * away * away
+        loss += math.log(both) - (1.0 - share) * math.log(a) - share * math.log(b)
+    return 0.5 * together * loss
 
 
 @compiled

@@ -60,18 +60,18 @@ class Asked(NamedTuple):
 
 
 @compiled
-def known(candidates: Candidates, n: int, node: int, doubts: int) -> bool:
-    """Whether a set of a node is among the first ``n``."""
+def known(candidates: Candidates, n: int, node: int, doubts: int) -> int:
+    """Which of the first ``n`` is this set of a node, -1 for none."""
     c = n - 1
     while c >= 0 and (candidates.doubts[c] != doubts or candidates.node[c] != node):
         c -= 1
-    return c >= 0
+    return c
 
 
 @compiled
 def put(candidates: Candidates, n: int, nodes: Nodes, i: int, doubts: int, bank: Bank, asked: Asked) -> int:
     """One more candidate, weighed; the number of them."""
-    if n >= len(candidates.node) or known(candidates, n, i, doubts):
+    if n >= len(candidates.node) or known(candidates, n, i, doubts) >= 0:
         return n
     root, solution = np.empty((SIZE, SIZE)), np.empty(SIZE)
     table, before = asked.table, bank.doubts[nodes.parent[i]]

@@ -22,6 +22,7 @@ from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor.edge_lines import Frame2d, Parts, found_at, merged
 from gripmon.monitor.ends_told import EndsTold, off_by_px
+from gripmon.monitor.lighting import Lighting, own_side
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, edges_at_ends, inner_edges, sides
@@ -77,8 +78,8 @@ class Shadow:
         covariance[LENGTHS, LENGTHS] = np.eye(2) * max(tracker.model_sigma_m, 1e-6) ** 2
         self._parts = Parts(gripper.edge_curved)
         ends = (edges_at_ends(gripper) & ~tracker.along)[self._parts.edge]
-        finger_of = gripper.edge_finger[self._parts.edge]
-        self._ends_of = [ends & (finger_of == finger) for finger in range(len(gripper.finger_ids))]
+        self._finger_of = gripper.edge_finger[self._parts.edge]
+        self._ends_of = [ends & (self._finger_of == finger) for finger in range(len(gripper.finger_ids))]
         self._belief = Belief(
             doubts_of(gripper, tracker.along, self._ends_of, self._parts.edge), self._axis, priors,
             risk=settings.policy.integrity_risk, covariance=covariance,
@@ -90,6 +91,7 @@ class Shadow:
         self._last_s: float | None = None
         self._jaw_m: float | None = None
         self._ends_told = EndsTold(len(self._ends_of))
+        self._lighting, self._light_kept = Lighting(), 1.0
         self.newest: Believed | None = None
 
     @property
@@ -109,7 +111,9 @@ class Shadow:
             return
         dt_s = 1.0 if self._last_s is None else now_s - self._last_s
         told = self._told(frame, looks, fit, now_s)
-        self.newest = self._belief.update(seen, dt_s, told, opening_m=self._opening_noise_m(frame))
+        self.newest = self._belief.update(
+            seen, dt_s, told, light_memory=self._light_kept, opening_m=self._opening_noise_m(frame)
+        )
         self._last_s = now_s
 
     def _opening_noise_m(self, frame: Frame) -> float:
@@ -185,6 +189,8 @@ class Shadow:
         shown = count > 0
         if len(np.unique(self._parts.edge[shown])) < FEWEST_EDGES:
             return None
+        side = own_side(main, self._finger_of, self._parts.of(main.prediction.layout), edges)
+        self._light_kept = self._lighting.kept(beside[np.arange(edges), side], noise)
         likeness = np.array([self._compare(e, beside[e], noise) if shown[e] else 0.0 for e in range(edges)])
         background = np.zeros(edges, np.int64)
         return Seen(rows, lines, white, searched, image, image_white, count, fitted, background, likeness, strength)
