@@ -57,7 +57,7 @@ class Lighting:
             return 1.0
         change = np.log(now[both] / self._then[both])
         by_noise = 2.0 * noise**2 / (grey.shape[1] * now[both] ** 2)
-        square = max(float(np.mean(np.square(change) - by_noise)), 0.0)
+        square = max(float(np.median(np.square(change) - by_noise)), 0.0)  # of a few something lies in front
         before, self._kept = self._kept, math.exp(-0.5 * square / ANOTHER_LIGHT**2)
         self._then = np.where(both, self._then, now)
         out = min(self._kept / before, 1.0)
