@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.options import add_command, count, deliver
 
 if TYPE_CHECKING:
-    from benchmarks.offline_intrinsics import Fits, Found
+    from benchmarks.offline_intrinsics import Fits, Found, Photographs
     from benchmarks.offline_plane import Errors, Revealed
+    from gripmon.model.targets import Chequerboard
 
 _DESCRIPTION = """\
 Calibrations on simulated images: error of the tool centre point (TCP) by the plane coincidence constraint against the
@@ -47,6 +48,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--trials", type=count, metavar="N", help=f"images of each kind of plate (default: {_TRIALS})")
     parser.add_argument("--seed", type=count, default=1, help="first seed (default: 1)")
+    parser.add_argument(
+        "--photographs", nargs=2, metavar=("FOLDER", "COLUMNSxROWS"), help="also of a chequerboard with so many corners"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the errors and what reveals a gap")
 
 
@@ -56,6 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     cv2.setNumThreads(1)
+    try:
+        board = _photographs(arguments.photographs)
+    except ValueError as error:
+        print(f"tools/bench offline: {error}", file=sys.stderr)
+        return 2
     from benchmarks import offline_intrinsics, offline_plane
 
     sizes = _QUICK if arguments.quick else (_TRIALS, _REVEALED, _SETS, _IMAGES)
@@ -66,14 +75,29 @@ def run(arguments: argparse.Namespace) -> int:
             errors += offline_plane.trials(trials, arguments.seed, print_m, bar.update)
         revealed = offline_plane.revealed(off, arguments.seed, bar.update)
         fits, found = offline_intrinsics.compare(sets, images, arguments.seed, bar.update)
+        photographs = offline_intrinsics.on_photographs(*board) if board else []
     faults = missed(errors)
-    text = report(errors, revealed, fits, found, arguments.seed, faults)
-    deliver(arguments, "offline", text, figures(errors, revealed, fits, found))
+    text = report(errors, revealed, fits, found, photographs, arguments.seed, faults)
+    deliver(arguments, "offline", text, figures(errors, revealed, fits, found, photographs))
     if arguments.picture is not None:
         from benchmarks import offline_plots
 
         offline_plots.draw(errors, revealed, arguments.picture)
     return 1 if faults else 0
+
+
+def _photographs(given: list[str] | None) -> tuple[Path, Chequerboard] | None:
+    """A folder and its board.  Raises ValueError for words that are none."""
+    from gripmon.model.targets import Chequerboard
+
+    if given is None:
+        return None
+    counts = given[1].split("x")
+    if len(counts) != 2 or not all(count.isdigit() and int(count) > 1 for count in counts):
+        raise ValueError(f"--photographs: {given[1]!r} isn't a board; numbers of inner corners, as 9x6")
+    if not Path(given[0]).is_dir():
+        raise ValueError(f"--photographs: {given[0]} is no folder")
+    return Path(given[0]), Chequerboard(int(counts[0]), int(counts[1]), 0.01)
 
 
 def missed(errors: list[Errors]) -> list[str]:
@@ -103,8 +127,9 @@ _WAY = {"known": "gripper known", "inferred": "gripper inferred", "single": "kno
 
 
 def report(
-    errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found], seed: int, faults: list[str]
-) -> str:
+    errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found],
+    photographs: list[Photographs], seed: int, faults: list[str],
+) -> str:  # fmt: skip
     """All tables, and what is missed."""
     parts = [
         f"first seed {seed}",
@@ -112,6 +137,7 @@ def report(
         _revealed_table(revealed),
         _fits_table(fits),
         _found_table(found),
+        *([_photographs_table(photographs)] if photographs else []),
         "\n".join(f"MISSED: {fault}" for fault in faults) or "every target is reached",
     ]
     return "\n\n".join(parts)
@@ -196,20 +222,38 @@ def _fits_table(fits: list[Fits]) -> str:
 
 
 def _found_table(found: list[Found]) -> str:
-    lines = ["plates found in the same images, and how long it takes"]
+    import numpy as np
+
+    lines = ["plates found in the same images; root mean square of a corner's error, each axis, and of the worst tenth"]
     for row in found:
         each = 1e3 * row.seconds / max(row.images, 1)
-        lines.append(f"{row.who:<22} {row.found:>4} of {row.images}, {each:.0f} ms an image")
+        rms = np.sqrt(row.error_px2) if row.error_px2 else np.full(1, np.nan)
+        lines.append(
+            f"{row.who:<24} {row.found:>4} of {row.images}, {np.sqrt(np.mean(rms**2)):.4f} px, "
+            f"{np.quantile(rms, 0.9):.4f} px, {each:.0f} ms an image"
+        )
     return "\n".join(lines)
 
 
-def figures(errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found]) -> dict[str, Any]:
+def _photographs_table(photographs: list[Photographs]) -> str:
+    lines = ["photographs: what a lens leaves of the corners (root mean square, each axis) where everybody finds them"]
+    lines += [
+        f"{row.who:<24} {row.found:>4} of {row.images}, {row.residual_px:.4f} px in {row.common}" for row in photographs
+    ]
+    return "\n".join(lines)
+
+
+def figures(
+    errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found],
+    photographs: list[Photographs],
+) -> dict[str, Any]:  # fmt: skip
     """Everything, as JSON takes it."""
     return {
         "plane": [_plain(row) for row in errors],
         "apart": [_plain(row) for row in revealed],
         "cameras": [_plain(row) for row in fits],
         "found": [_plain(row) for row in found],
+        "photographs": [_plain(row) for row in photographs],
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -80,9 +81,22 @@ class Setting:
         return made
 
 
-def views(lens: LensSettings, target: Chequerboard, count: int, rng: np.random.Generator) -> list[NDArray[np.uint8]]:
-    """Images of a plate held before a camera, tilted to all sides, whole in every view."""
-    images: list[NDArray[np.uint8]] = []
+class View(NamedTuple):
+    """An image of a chequerboard, and where its n corners truly are in it, ``corners_px`` (n, 2), row by row."""
+
+    image: NDArray[np.uint8]
+    corners_px: Array
+
+
+def corners_of(target: Chequerboard) -> Array:
+    """(n, 3) row by row, on the plate."""
+    r, c = np.mgrid[: target.rows, : target.columns]
+    return np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1) * target.square_m
+
+
+def views(lens: LensSettings, target: Chequerboard, count: int, rng: np.random.Generator) -> list[View]:
+    """A plate held before a camera, tilted to all sides, whole in every view."""
+    images: list[View] = []
     camera = make_camera(lens)
     size = np.array([target.columns - 1, target.rows - 1]) * target.square_m
     outer = np.array([[-1, -1], [target.columns, -1], [target.columns, target.rows], [-1, target.rows]])
@@ -100,5 +114,6 @@ def views(lens: LensSettings, target: Chequerboard, count: int, rng: np.random.G
                 continue
         light = Plate(target, cam_T_plate, Print(margin=np.inf)).light(lens, Sensor().psf_sigma_px)
         noisy = light + rng.normal(0.0, 1.5, light.shape)
-        images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+        corners_px = camera.project(corners_of(target) @ rotation.T + cam_T_plate[:3, 3])
+        images.append(View(np.clip(np.rint(noisy), 0, 255).astype(np.uint8), corners_px))
     return images

@@ -1,9 +1,8 @@
 """Cameras calibrated from the same images by others and by us, for ``tools/bench offline``.
 
-Everybody fits the model with two radial and two tangential coefficients; OpenCV with its own corners and with ours
-(``cv2.findChessboardCorners`` and ``cv2.cornerSubPix``, which on these images are eight times as accurate as
-``cv2.findChessboardCornersSB``), COLMAP's bundle adjustment (``pycolmap``, installed with the extra ``bench``) with
-ours, as it doesn't look for plates.
+Everybody fits the model with two radial and two tangential coefficients; OpenCV with its own corners
+(``cv2.findChessboardCorners`` and ``cv2.cornerSubPix``, and those of ``cv2.findChessboardCornersSB``) and with ours,
+COLMAP's bundle adjustment (``pycolmap``, installed with the extra ``bench``) with ours, as it doesn't look for plates.
 """
 
 from __future__ import annotations
@@ -11,17 +10,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.offline_images import views
+from benchmarks.offline_images import View, corners_of, views
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.intrinsics import calibrate
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import BrownConradyLens, LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation
+from gripmon.model.images import image_paths
 from gripmon.model.records import Array
 from gripmon.model.targets import Chequerboard
 
@@ -35,7 +37,10 @@ LENS = BrownConradyLens(
     coefficients=(-0.21, 0.09, 0.0008, -0.0005),
 )
 BOARD = Chequerboard(9, 6, 0.025)
-OURS, OPENCV, OPENCV_OURS, COLMAP = "gripmon", "OpenCV", "OpenCV, our corners", "COLMAP, our corners"
+OURS, OPENCV, OPENCV_SB = "gripmon", "OpenCV", "OpenCV SB"
+OPENCV_OURS, COLMAP = "OpenCV, our corners", "COLMAP, our corners"
+FEWEST_PHOTOGRAPHS = 4
+"""In which everybody found the plate, from which a lens is fitted."""
 _GRID = 12
 _WINDOW_PX = (5, 5)
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
@@ -61,73 +66,142 @@ class Fits:
 
 @dataclass
 class Found:
-    """Corners that were looked for: images in which the plate was found, and errors of what was (px, each axis)."""
+    """Corners that were looked for: images in which the plate was found, and for each the mean square ``error_px2`` of
+    what was, each axis.
+    """
 
     who: str
     images: int = 0
     found: int = 0
     seconds: float = 0.0
+    error_px2: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Photographs:
+    """A lens fitted to the corners that one found in photographs of which all found some, of ``found`` images; and the
+    root mean square of what is left, each axis.
+    """
+
+    who: str
+    images: int
+    found: int
+    common: int
+    residual_px: float
 
 
 def compare(
     sets: int, images: int, seed: int, progress: Callable[[], object] = lambda: None
 ) -> tuple[list[Fits], list[Found]]:
     """Everybody on ``sets`` sets of images, and who finds the plate where something covers a part of it."""
-    fits = {who: Fits(who) for who in (OURS, OPENCV, OPENCV_OURS, *([COLMAP] if colmap_installed() else []))}
-    found = {(who, covered): Found(f"{who}{covered}") for covered in ("", ", part covered") for who in (OURS, OPENCV)}
+    fits = {who: Fits(who) for who in (OURS, *_THEIRS, OPENCV_OURS, *([COLMAP] if colmap_installed() else []))}
+    found = {(who, covered): Found(f"{who}{covered}") for covered in ("", ", part covered") for who in (OURS, *_THEIRS)}
     for number in range(sets):
         rng = np.random.default_rng([seed, number])
         whole = views(LENS, BOARD, images, rng)
-        for covered, shown in (("", whole), (", part covered", [_covered(i, rng) for i in whole])):
-            sightings = _ours(shown, found[OURS, covered])
-            theirs = _opencv(shown, found[OPENCV, covered])
+        for covered, shown in (("", whole), (", part covered", [_covered(view, rng) for view in whole])):
+            sightings = [_searched(lambda i: _ours(i, BOARD), view, found[OURS, covered]) for view in shown]
+            theirs = {
+                who: [_searched(lambda i, f=find: f(i, BOARD), view, found[who, covered]) for view in shown]
+                for who, find in _THEIRS.items()
+            }
             if not covered:
-                _fit_all(fits, sightings, theirs)
+                _fit_all(fits, [s for s in sightings if s], {who: _points(of, BOARD) for who, of in theirs.items()})
         progress()
     return list(fits.values()), list(found.values())
 
 
-def _ours(images: Sequence[NDArray[np.uint8]], count: Found) -> list[Sighting]:
+def on_photographs(folder: Path, board: Chequerboard) -> list[Photographs]:
+    """Everybody's corners in the photographs of a folder; nobody knows the truth there, but one lens has to explain
+    them.
+    """
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in image_paths([folder])]
+    every = {OURS: [_ours(image, board) for image in images]}
+    points: dict[str, list[tuple[Array, Array] | None]] = {
+        OURS: [(s.plate_m, s.uv_px) if s else None for s in every[OURS]],
+        **{who: [_of(find(image, board), board) for image in images] for who, find in _THEIRS.items()},
+    }
+    common = [k for k in range(len(images)) if all(of[k] for of in points.values())]
+    out = []
+    for who, of in points.items():
+        shared = [found for k in common if (found := of[k])]
+        left = _residual_px(shared, images[0].shape) if len(shared) >= FEWEST_PHOTOGRAPHS else float("nan")
+        out.append(Photographs(who, len(images), sum(found is not None for found in of), len(common), left))
+    return out
+
+
+def _residual_px(points: Points, shape: tuple[int, ...]) -> float:
+    plates = [plate.astype(np.float32) for plate, _ in points]
+    uv = [px.reshape(-1, 1, 2).astype(np.float32) for _, px in points]
+    size = (shape[1], shape[0])
+    rms, *_ = cv2.calibrateCamera(plates, uv, size, None, None, flags=cv2.CALIB_FIX_K3)  # type: ignore[call-overload]
+    return float(rms) / np.sqrt(2.0)
+
+
+def _searched(find: Callable[[NDArray[np.uint8]], Any], view: View, count: Found) -> Any:
+    """What one finds in a view, or None; counted."""
     start = time.perf_counter()
-    sights = [detect(image, BOARD, "") for image in images]
-    out = [sight for sight in sights if isinstance(sight, Sighting)]
-    count.images, count.found = count.images + len(images), count.found + len(out)
+    out = find(view.image)
     count.seconds += time.perf_counter() - start
+    count.images += 1
+    if out is not None:
+        uv = out.uv_px if isinstance(out, Sighting) else out
+        away = np.linalg.norm(uv[:, None] - view.corners_px, axis=2)  # squares are many pixels wide
+        count.found += 1
+        count.error_px2.append(0.5 * float(np.mean(away.min(axis=1) ** 2)))
     return out
 
 
-def _opencv(images: Sequence[NDArray[np.uint8]], count: Found) -> Points:
-    start, out = time.perf_counter(), []
-    size = (BOARD.columns, BOARD.rows)
-    r, c = np.mgrid[: BOARD.rows, : BOARD.columns]
-    plate = np.stack([c.ravel(), r.ravel(), np.zeros(c.size)], axis=1) * BOARD.square_m
-    for image in images:
-        seen, uv = cv2.findChessboardCorners(image, size)
-        if seen:
-            uv = cv2.cornerSubPix(image, uv, _WINDOW_PX, (-1, -1), _STOP)
-            out.append((plate, np.asarray(uv, np.float64).reshape(-1, 2)))
-    count.images, count.found = count.images + len(images), count.found + len(out)
-    count.seconds += time.perf_counter() - start
-    return out
+def _ours(image: NDArray[np.uint8], board: Chequerboard) -> Sighting | None:
+    sight = detect(image, board, "")
+    return sight if isinstance(sight, Sighting) else None
 
 
-def _covered(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _classic(image: NDArray[np.uint8], board: Chequerboard) -> Array | None:
+    seen, uv = cv2.findChessboardCorners(image, (board.columns, board.rows))
+    if not seen:
+        return None
+    return np.asarray(cv2.cornerSubPix(image, uv, _WINDOW_PX, (-1, -1), _STOP), np.float64).reshape(-1, 2)
+
+
+def _sector_based(image: NDArray[np.uint8], board: Chequerboard) -> Array | None:
+    """Without the flag for accuracy, with which it is less accurate."""
+    seen, uv = cv2.findChessboardCornersSB(image, (board.columns, board.rows))
+    return np.asarray(uv, np.float64).reshape(-1, 2) if seen else None
+
+
+_THEIRS: dict[str, Callable[[NDArray[np.uint8], Chequerboard], Array | None]] = {
+    OPENCV: _classic,
+    OPENCV_SB: _sector_based,
+}
+
+
+def _of(uv: Array | None, board: Chequerboard) -> tuple[Array, Array] | None:
+    return None if uv is None else (corners_of(board), uv)
+
+
+def _points(found: Sequence[Array | None], board: Chequerboard) -> Points:
+    return [of for uv in found if (of := _of(uv, board))]
+
+
+def _covered(view: View, rng: np.random.Generator) -> View:
     """A finger from the left or the right border to beyond the middle."""
-    height, width = image.shape
+    height, width = view.image.shape
     top, thick = rng.uniform(0.25, 0.6) * height, 0.18 * height
     box = np.array([[-5, top], [0.6 * width, top + 12], [0.6 * width, top + thick], [-5, top + thick + 12]])
     if rng.random() < 0.5:
         box[:, 0] = width - 1 - box[:, 0]
-    out = image.copy()
+    out = view.image.copy()
     cv2.fillPoly(out, [np.rint(box).astype(np.int32)], 95)
-    return out
+    return View(out, view.corners_px)
 
 
-def _fit_all(fits: dict[str, Fits], sightings: list[Sighting], theirs: Points) -> None:
+def _fit_all(fits: dict[str, Fits], sightings: list[Sighting], theirs: dict[str, Points]) -> None:
     ours: Points = [(s.plate_m, s.uv_px) for s in sightings]
     ways: dict[str, Callable[[], tuple[Array, float | None]]] = {
         OURS: lambda: _gripmon(sightings),
-        OPENCV: lambda: (_calibrate_camera(theirs), None),
+        OPENCV: lambda: (_calibrate_camera(theirs[OPENCV]), None),
+        OPENCV_SB: lambda: (_calibrate_camera(theirs[OPENCV_SB]), None),
         OPENCV_OURS: lambda: (_calibrate_camera(ours), None),
         COLMAP: lambda: (_colmap(ours), None),
     }
