@@ -228,7 +228,7 @@ def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest
     # A sweep looks with the same edges.
     assert main(["check", str(rig / "config.yaml"), "--sweep", "--distance", "0.12", "--tilt", "30", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
-    assert present["sigma"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
+    assert present["accuracy"]["expected"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
     assert main(["check", str(rig / "untaught.yaml"), "--verbose"]) == 0
     assert "gripmon teach" in capsys.readouterr().out
 

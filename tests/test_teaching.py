@@ -252,7 +252,7 @@ def test_what_the_images_show_off_the_reference_is_in_every_bound(bevel_m: float
     assert taught.reference_offset[2] == pytest.approx(shift_m, abs=1.2 * bevel_m + 2e-5)
     edges = arrays(taught, off)
     bounds_m = [
-        forecast_frame(RIG._replace(taught=known), off, OPENING_M).protection.position_m
+        forecast_frame(RIG._replace(taught=known), off, OPENING_M).absolute.position_m
         for known in (replace(edges, reference_offset=np.zeros(6)), edges)
     ]
     assert bounds_m[1] - bounds_m[0] == pytest.approx(offset_m, rel=0.05)

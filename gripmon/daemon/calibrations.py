@@ -272,7 +272,7 @@ def view_in(
         raise InputError("is missing: a rough view needs one; a file of gripmon calibrate intrinsics", "camera")
     made = make_camera(lens)
     middle = 0.5 * (made.width_px - 1.0), 0.5 * (made.height_px - 1.0)
-    return made, Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).cam_T_grip(towards(made, middle))
+    return made, Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).pose(towards(made, middle))
 
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:

@@ -93,7 +93,7 @@ class Teaching:
         untaught = Rig(config.camera, config.gripper, self.settings)
         taught = untaught._replace(taught=self.edges)
         before, after = (kept(rig, config.reference, frames) for rig in (untaught, taught))
-        return before, with_help(after, taught, config.reference, lambda: frames)
+        return before, with_help(after, taught, lambda rig: kept(rig, config.reference, frames))
 
     def text(self) -> str:
         """The taught model's file (YAML)."""

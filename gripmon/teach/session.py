@@ -21,16 +21,14 @@ import numpy as np
 from gripmon import __version__
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.io.sources import Source, Waiting
-from gripmon.judge.drift import foresee
 from gripmon.judge.inspection import inspect
-from gripmon.judge.recalibrate import refusal
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
-from gripmon.monitor import CORNER_COUNTS, MonitorSettings
-from gripmon.teach.accuracy import Promise, forecast_accuracy
+from gripmon.monitor import MonitorSettings
+from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.api import Picture
 from gripmon.teach.corner_pose import (
     CornerPose,
@@ -44,6 +42,7 @@ from gripmon.teach.corner_pose import (
     prior_of,
     usual_view,
 )
+from gripmon.teach.kept import promise_of
 from gripmon.teach.measure import Taught, teach
 from gripmon.teach.messages import (
     BadRequest,
@@ -68,7 +67,6 @@ from gripmon.track.edges.taught import own_covariance
 
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
-_STEP_M = 1e-4  # step of the TCP for which the delay is given
 
 
 class Evaluation(NamedTuple):
@@ -139,22 +137,12 @@ class Setup:
         opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
         with contextlib.suppress(TeachingRefused):
             taught = self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
-        frame = forecast_accuracy(self.camera, gripper, settings, reference, jaw_opening_m, taught)
+        rig, cam_T_grip = Rig(self.camera, gripper, settings, taught), from_record(reference.cam_T_grip)
+        frame = forecast_frame(rig, cam_T_grip, jaw_opening_m, with_jaw=True)
         if not frame.enough:
             return None
-        detectable = foresee(frame.covariance, settings.drift)
-        taken = gripper.innermost_corners(frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
-        promise = Promise.of(frame.protection, settings.policy)
-        return Expectation(
-            edges=frame.edges,
-            sigma=tuple(frame.sigma.tolist()),
-            weakest=tuple(frame.weakest.tolist()),
-            smallest=tuple(detectable.smallest.tolist()),
-            promise=promise.text(),
-            reachable=promise.reachable,
-            delay_frames=tuple(detectable.delay_frames(_STEP_M, axis) for axis in range(3)),
-            recalibration=refusal(gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]),
-        )
+        promise = promise_of(rig, cam_T_grip, jaw_opening_m, frame)
+        return Expectation(accuracy=frame, promise=f"forecast: {promise.promise()}", reachable=promise.reachable)
 
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
         """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
