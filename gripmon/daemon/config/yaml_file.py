@@ -82,9 +82,6 @@ def builtin_config(name: str) -> Path:
 
 def read_configuration(path: Path) -> dict[str, Any]:
     """The mapping in a configuration.  :class:`ConfigError`, which names the type of any other gripmon file."""
-    inside = path / "config.yaml"  # as gripmon teach and setup name it
-    if inside.is_file():
-        raise ConfigError(path, "", "is a folder", f"the configuration in it, {inside}")
     if path.parts[:1] == ("configs",) and not path.exists():  # as examples name them, in a checkout
         with contextlib.suppress(FileNotFoundError):
             shipped = builtin_config(str(path.relative_to("configs")))

@@ -17,6 +17,7 @@ from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
 from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config.project import FILES
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
 from gripmon.daemon.teaching.written import config_text, with_taught
@@ -34,7 +35,7 @@ from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtEdges, TaughtModel
 
-TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
+TAUGHT, CONFIG, CORNERS, IMAGES = FILES["taught"], FILES["config"], "corners.yaml", "teaching"
 
 
 class FileSaving:
