@@ -73,11 +73,9 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     ``back``: where the page goes when the person is done.
     """
 
-    version: str
     width_px: int
     height_px: int
     corners: tuple[str, ...]
-    fingers: dict[str, str]
     places: dict[str, Place | None]
     pictures: tuple[PictureInfo, ...]
     live: str | None
@@ -119,14 +117,11 @@ class Expectation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ReferenceReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``id`` with ``translation_m``, the angle between camera and gripper, and standard deviations (6,)."""
+    """``id`` with standard deviations (6,)."""
 
     id: str
-    translation_m: tuple[float, float, float]
-    turn_rad: float
     sigma: tuple[float, ...]
     corners: int | None
-    weighted_rms: float | None
     rival: bool
 
 

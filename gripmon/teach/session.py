@@ -18,12 +18,11 @@ from typing import NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from gripmon import __version__
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.io.sources import Source, Waiting
 from gripmon.judge.inspection import inspect
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, rotation_angle, to_record
+from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
@@ -219,13 +218,10 @@ class TeachSession:
     def state(self) -> State:
         setup, gripper = self._setup, self._setup.gripper
         opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
-        finger = gripper.point_finger[gripper.corner_points].tolist()
         return State(
-            version=__version__,
             width_px=setup.camera.width_px,
             height_px=setup.camera.height_px,
             corners=gripper.corner_ids,
-            fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
             places={name: _place(at) for name, at in setup.first_places(opening_m).items()},
             pictures=self._infos(),
             has_jaw=gripper.has_jaw,
@@ -358,11 +354,8 @@ def reply(found: Evaluation) -> Reply:
 def _reference_reply(reference: ReferenceRecord, pose: CornerPose | None) -> ReferenceReply:
     return ReferenceReply(
         id=reference.reference_id,
-        translation_m=reference.cam_T_grip.translation_m,
-        turn_rad=rotation_angle(from_record(reference.cam_T_grip)[:3, :3]),
         sigma=tuple(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()).tolist()),
         corners=None if pose is None else len(pose.corners),
-        weighted_rms=None if pose is None else pose.weighted_rms,
         rival=pose is not None and pose.rival,
     )
 

@@ -18,9 +18,10 @@ from gripmon.calibrate.detection import BLURRED_PX
 from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
 from gripmon.daemon.config.project import FILES
+from gripmon.daemon.config.writing import with_taught
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
-from gripmon.daemon.teaching.written import config_text, with_taught
+from gripmon.daemon.teaching.written import config_text
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
@@ -189,12 +190,8 @@ class FileSaving:
     def _config(self, order: SaveOrder, found: Evaluation, taught: bool) -> str:
         given = self._inputs.config
         if given is not None:
-            return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
-        return config_text(self._inputs, order, found, TAUGHT if taught else None, self._relative)
-
-    def _relative(self, path: Path, to: Path | None = None) -> str:
-        """The path relative to ``to``, or to the output folder."""
-        return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
+            return with_taught(given.path, self._paths["taught"])
+        return config_text(self._inputs, order, found, TAUGHT if taught else None)
 
     def _try_out(self, texts: Mapping[str, str]) -> None:
         """Check in a temporary folder that the configuration is valid; otherwise nothing is written."""
