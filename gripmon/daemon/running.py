@@ -68,7 +68,7 @@ def _closing(parts: Parts, lines: Path | None) -> Iterator[tuple[Parts, Snapshot
             faults.append(lambda: file.failure)
         faults.append(lambda: keeper.failure)
         snapshots = closing.enter_context(contextlib.closing(Snapshots(parts.outlines)))
-        reports = replace(parts.reports, faults=(*faults, *parts.reports.faults))
+        reports = replace(parts.reports, faults=[*faults, *parts.reports.faults])
         with _steady_interpreter():
             yield replace(parts, outputs=outputs, reports=reports), snapshots
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -203,14 +202,12 @@ class FileSaving:
             trial.write_text(texts["config"], encoding="utf-8")
             try:
                 values = read_yaml(trial)
-                values["gripper"] = str((base / values["gripper"]).resolve())
+                for key in ("gripper", "camera", "reference"):
+                    if isinstance(values.get(key), str):
+                        values[key] = str((base / values[key]).resolve())
                 if "taught" in texts:
                     (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
                     values["taught"] = TAUGHT
-                for key in ("camera", "reference"):
-                    if isinstance(values.get(key), str):
-                        shutil.copy(base / values[key], Path(name) / f"{key}.yaml")
-                        values[key] = f"{key}.yaml"
                 trial.write_text(as_yaml(values), encoding="utf-8")
                 load_config(trial, check_source=False, with_taught="taught" in texts)
             except (ConfigError, yaml.YAMLError, OSError) as error:
