@@ -13,19 +13,28 @@ from support.grippers import gripper_from_dict
 from support.meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
 from support.sampled import INDEPENDENT, OPENING_M, NoisyMeter
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
-from support.watched import reference_of, watched
+from support.watched import watched
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy, weakest_direction
+from gripmon.teach.accuracy import Accuracy, forecast_frame, weakest_direction
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges import MeasurementSettings
 
 
-def forecast(lens: LensSettings = PAPER_LENS, **settings: object) -> AccuracyForecast:
+def forecast(lens: LensSettings = PAPER_LENS, **settings: object) -> Accuracy:
     known = MonitorSettings(**{"floor_m": 0.0, "floor_rad": 0.0, "corners": INDEPENDENT, **settings})  # type: ignore[arg-type]
-    return forecast_accuracy(make_camera(lens), box_gripper(), known, reference_of(nominal_cam_T_grip()), OPENING_M)
+    rig = Rig(make_camera(lens), box_gripper(), known)
+    return forecast_frame(rig, nominal_cam_T_grip(), OPENING_M, with_jaw=True)
+
+
+def lever_m(gripper: Gripper) -> float:
+    """Root mean square distance of the corners from the TCP, by which a turn of one radian moves them."""
+    corners_m = gripper.points_grip_m(OPENING_M)[gripper.landmarks]
+    return float(np.sqrt((corners_m**2).sum(axis=1).mean()))
 
 
 def box_model() -> dict[str, Any]:
@@ -53,13 +62,13 @@ def test_expected_sigmas_are_the_spread_of_sampled_measurements(lens: LensSettin
         errors[k] = difference(measured.cam_T_grip, nominal_cam_T_grip())
         seen_m[k] = measured.jaw_opening_m - OPENING_M
     expected = forecast(lens)
-    sigma = expected.sigma if reported else expected.jaw.sigma
+    sigma = (expected.expected if reported else expected.jaw.unknown).array
     # A sampled standard deviation scatters by 1 / sqrt(2 n); the robust weights cost a few per cent.
     np.testing.assert_allclose(errors.std(axis=0) / sigma, 1.0, atol=4.0 / np.sqrt(2.0 * samples) + 0.05)
     if not reported:
-        assert seen_m.std() == pytest.approx(expected.jaw.sigma_m, rel=0.25)
+        assert seen_m.std() == pytest.approx(expected.jaw.unknown.jaw_m, rel=0.25)
         # Along the weakest direction the errors of pose and opening go together as told.
-        scale = np.array([1.0] * 3 + [expected.lever_m] * 3)
+        scale = np.array([1.0] * 3 + [lever_m(box_gripper())] * 3)
         _, _, axes = np.linalg.svd(errors * scale)
         told = abs(np.corrcoef(errors * scale @ axes[0], seen_m)[0, 1])
         assert told == pytest.approx(expected.jaw.correlation, abs=0.05)
@@ -70,7 +79,7 @@ def test_simulated_sequences_scatter_as_expected(measurement: str):
     """Another noise and texture than assumed: within a factor of three."""
     settings = MonitorSettings(measurement=measurement)  # type: ignore[arg-type]
     camera, gripper = make_camera(PAPER_LENS), box_gripper(sharp=False)
-    expected = forecast_accuracy(camera, gripper, settings, reference_of(nominal_cam_T_grip()), OPENING_M).sigma
+    expected = forecast_frame(Rig(camera, gripper, settings), nominal_cam_T_grip(), OPENING_M).expected.array
     spread = np.nanstd(watched("static", measurement).errors(), axis=0)
     assert (spread < 3.0 * expected).all()
     assert (spread > 0.1 * expected).all()
@@ -79,7 +88,7 @@ def test_simulated_sequences_scatter_as_expected(measurement: str):
 
 
 def test_an_opening_that_is_wrong_shifts_the_pose_of_a_rendered_image_as_told():
-    told = forecast().jaw.pose_per_m
+    told = forecast().jaw.pose_per_jaw_m.array
     image, wrong_m = picture(plain_scenario()), 1e-4
     sure = type(meter())(make_camera(PAPER_LENS), box_gripper(), MeasurementSettings(), 0.0)
     right, wrong = (measure(image, using=sure, jaw_opening_m=OPENING_M + e).cam_T_grip for e in (0.0, wrong_m))
@@ -95,9 +104,9 @@ def test_opening_and_distance_are_what_the_box_fingers_cannot_separate():
     assert expected.edges == 8 and expected.enough
     assert expected.jaw.correlation > 0.85
     assert expected.jaw.growth == pytest.approx(1.0 / np.sqrt(1.0 - expected.jaw.correlation**2))
-    z_exact, z_free = expected.sigma[2], expected.jaw.sigma[2]
+    z_exact, z_free = expected.expected.tcp_m[2], expected.jaw.unknown.tcp_m[2]
     assert z_free / z_exact == pytest.approx(expected.jaw.growth, rel=0.1), "the weakest direction is nearly z"
-    assert np.abs(expected.weakest[:3]).argmax() == 2
+    assert np.abs(expected.weakest.tcp_m).argmax() == 2
 
 
 def test_an_exact_opening_leaves_the_pose_of_six_unknowns():
@@ -107,18 +116,18 @@ def test_an_exact_opening_leaves_the_pose_of_six_unknowns():
     model["fingers"] = {"left": {}, "right": {}}
     rigid = gripper_from_dict(model)
     settings = MonitorSettings(floor_m=0.0, floor_rad=0.0, jaw_sigma_m=0.0)
-    six = forecast_accuracy(make_camera(PAPER_LENS), rigid, settings, reference_of(nominal_cam_T_grip()), None)
+    six = forecast_frame(Rig(make_camera(PAPER_LENS), rigid, settings), nominal_cam_T_grip(), None, with_jaw=True)
     assert six.jaw is None
     seven = forecast(jaw_sigma_m=0.0, corners=MeasurementSettings())
-    np.testing.assert_allclose(seven.sigma, six.sigma, rtol=0.05)
+    np.testing.assert_allclose(seven.expected.array, six.expected.array, rtol=0.05)
 
 
 def test_the_weakest_direction_is_that_of_the_largest_spread():
-    rng, lever_m = np.random.default_rng(3), 0.02
+    rng, radius_m = np.random.default_rng(3), 0.02
     mixing = rng.normal(size=(6, 6)) * np.array([1e-6, 2e-6, 1e-5, 1e-4, 3e-4, 5e-4])[:, None]
     covariance = mixing @ mixing.T
-    weakest = weakest_direction(covariance, lever_m)
-    scale = np.array([1.0] * 3 + [lever_m] * 3)
+    weakest = weakest_direction(covariance, radius_m)
+    scale = np.array([1.0] * 3 + [radius_m] * 3)
     length = np.linalg.norm(weakest * scale)
     directions = rng.normal(size=(20000, 6))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -138,11 +147,10 @@ def test_corners_nearly_on_a_line_show_it_in_the_covariance():
     model.pop("faces")
     thin = gripper_from_dict(model)
     settings = MonitorSettings(measurement="corners", corners=INDEPENDENT)
-    camera, reference = make_camera(PAPER_LENS), reference_of(nominal_cam_T_grip())
-    wide, squeezed = (forecast_accuracy(camera, g, settings, reference, OPENING_M) for g in (box_gripper(), thin))
-    assert squeezed.sigma[3] > 3.0 * wide.sigma[3]
-    turn = np.abs(squeezed.weakest[3:]) * squeezed.lever_m
-    assert turn.argmax() == 0, "about the line"
+    rigs = [Rig(make_camera(PAPER_LENS), gripper, settings) for gripper in (box_gripper(), thin)]
+    wide, squeezed = (forecast_frame(rig, nominal_cam_T_grip(), OPENING_M) for rig in rigs)
+    assert squeezed.expected.rotation_rad[0] > 3.0 * wide.expected.rotation_rad[0]
+    assert np.abs(squeezed.weakest.rotation_rad).argmax() == 0, "about the line"
 
 
 # --- the command ---

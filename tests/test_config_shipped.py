@@ -16,7 +16,8 @@ from gripmon.daemon.config import (
     read_gripper,
 )
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy
+from gripmon.teach.accuracy import Accuracy, forecast_frame
+from gripmon.teach.visibility import Rig
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"
@@ -68,24 +69,25 @@ WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
 
 
 @pytest.fixture(params=WRIST)
-def shipped(request: pytest.FixtureRequest) -> tuple[MonitorSettings, AccuracyForecast]:
+def shipped(request: pytest.FixtureRequest) -> tuple[MonitorSettings, Accuracy]:
     """A shipped configuration's settings and what one frame of its view is expected to show."""
     config = load_config(builtin_config(request.param), check_source=False, with_taught=False)
     monitor = config.settings.monitor
-    expected = forecast_accuracy(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m)
-    return monitor, expected
+    rig = Rig(config.camera, config.gripper, monitor)
+    return monitor, forecast_frame(rig, config.cam_T_grip, config.jaw_opening_m)
 
 
-def test_a_shipped_view_keeps_its_alert_limits(shipped: tuple[MonitorSettings, AccuracyForecast]):
+def test_a_shipped_view_keeps_its_alert_limits(shipped: tuple[MonitorSettings, Accuracy]):
     """Else none of its transforms would ever be valid."""
     monitor, outlook = shipped
-    assert outlook.protection.position_m <= monitor.policy.alert_limit_m
-    assert outlook.protection.rotation_rad <= monitor.policy.alert_limit_rad
+    bound = outlook.by(monitor.policy.valid_by)
+    assert bound.position_m <= monitor.policy.alert_limit_m
+    assert bound.rotation_rad <= monitor.policy.alert_limit_rad
 
 
-def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(shipped: tuple[MonitorSettings, AccuracyForecast]):
+def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(shipped: tuple[MonitorSettings, Accuracy]):
     """By what one frame of it is certain to; the mean of frames whose errors last is hardly more."""
     monitor, outlook = shipped
     if monitor.recalibration.mode == "off":
         return
-    assert outlook.enough and max(outlook.sigma[:3]) <= monitor.recalibration.sure_sigma_m
+    assert outlook.enough and max(outlook.expected.tcp_m) <= monitor.recalibration.sure_sigma_m

@@ -11,7 +11,7 @@ from support.daemon_bench import Bench
 from support.loopback import frame_record, reference_record, wait_until
 from support.stand_ins import ScriptedMonitor
 
-from gripmon.daemon import supervised
+from gripmon.daemon import loop as daemon_loop
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.io.sources import Waiting
 from gripmon.model.records import (
@@ -217,7 +217,7 @@ def test_notices_of_the_start_are_alerts_behind_the_reference():
 @pytest.fixture(autouse=True)
 def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """These frames take no time, of which commands would get a quarter."""
-    monkeypatch.setattr(supervised, "_COMMAND_PAUSE_RATIO", 0.0)
+    monkeypatch.setattr(daemon_loop, "_COMMAND_PAUSE_RATIO", 0.0)
 
 
 def test_a_command_is_kept_and_published_before_it_is_answered():

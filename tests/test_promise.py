@@ -19,15 +19,12 @@ from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Protection
-from gripmon.teach.accuracy import Promise, forecast_frame, with_bevels
+from gripmon.model.records import Protection, ValidBy
+from gripmon.teach.accuracy import forecast_frame, with_bevels
+from gripmon.teach.kept import Kept, Sizes
 from gripmon.teach.visibility import Rig
 
 DEMO = builtin_config("demo.yaml")
-
-
-def bound(position_m: float, rotation_rad: float) -> Protection:
-    return Protection(position_m, rotation_rad, 1e-5)
 
 
 def with_setting(tmp_path: Path, setting: str) -> Path:
@@ -37,23 +34,32 @@ def with_setting(tmp_path: Path, setting: str) -> Path:
     return path
 
 
+def promised(position_m: float, rotation_rad: float, **policy: float) -> Kept:
+    sizes, limits = Sizes.of(np.array([(position_m, rotation_rad)])), PolicySettings(**policy)
+    limits_of = limits.alert_limit_m, limits.alert_limit_rad
+    return Kept(0, 0, 0, 0, ValidBy.ABSOLUTE, sizes, sizes, "", 0, None, *limits_of, forecast=True)
+
+
 def test_what_is_needed_is_enough_and_is_said_of_either_limit():
-    wide, turned = bound(8.31e-3, 1e-4), bound(5e-5, 0.0445)
-    found = Promise.of(wide, PolicySettings())
-    assert not found.reachable and found.needed == "alert_limit_m of at least 0.0084 (8.4 mm)"
-    assert "alert limit 1 mm, 2 degrees: NOT reachable: valid needs alert_limit_m of at least 0.0084" in found.text()
-    assert Promise.of(wide, PolicySettings(alert_limit_m=0.0084)).reachable
-    assert not Promise.of(wide, PolicySettings(alert_limit_m=0.0082)).reachable
-    assert Promise.of(turned, PolicySettings()).needed == "alert_limit_rad of at least 0.045 (2.6 degrees)"
-    both = Promise.of(bound(8.31e-3, 0.0445), PolicySettings()).needed
+    found = promised(8.31e-3, 1e-4)
+    assert not found.reachable and found.needed() == "alert_limit_m of at least 0.0084 (8.4 mm)"
+    assert "no transform can be valid: valid needs alert_limit_m of at least 0.0084" in found.promise()
+    assert promised(8.31e-3, 1e-4, alert_limit_m=0.0084).reachable
+    assert not promised(8.31e-3, 1e-4, alert_limit_m=0.0082).reachable
+    assert promised(5e-5, 0.0445).needed() == "alert_limit_rad of at least 0.045 (2.6 degrees)"
+    both = promised(8.31e-3, 0.0445).needed()
     assert "alert_limit_m" in both and "alert_limit_rad" in both
-    nothing = Promise(Protection(math.inf, 0.1, 1e-5), 5e-4, 0.02)
-    assert not nothing.reachable and "no limit would do" in nothing.text()
+    nothing = promised(math.inf, 0.1)
+    assert not nothing.reachable and "no limit would do" in nothing.promise()
 
 
 def rig() -> tuple[Rig, np.ndarray]:
     config = load_config(DEMO)
     return Rig(config.camera, config.gripper, config.settings.monitor, None), config.cam_T_grip
+
+
+def bound_of(usual: Rig, cam_T_grip: np.ndarray) -> Protection:
+    return forecast_frame(usual, cam_T_grip, None).absolute
 
 
 def test_a_view_promises_less_than_its_covariance_alone_and_less_at_a_larger_risk():
@@ -62,21 +68,20 @@ def test_a_view_promises_less_than_its_covariance_alone_and_less_at_a_larger_ris
     """
     usual, cam_T_grip = rig()
     foreseen = forecast_frame(usual, cam_T_grip, None)
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(foreseen.covariance[:3, :3])[-1]))
-    assert foreseen.protection.position_m > 4.42 * sigma_m
+    assert foreseen.absolute.position_m > 4.42 * foreseen.tcp_sigma_m
     settings = usual.settings
     bold = msgspec.structs.replace(settings, policy=msgspec.structs.replace(settings.policy, integrity_risk=1e-2))
-    risky = forecast_frame(usual._replace(settings=bold), cam_T_grip, None).protection
-    assert 0.2 < risky.position_m / foreseen.protection.position_m < 0.9
+    risky = bound_of(usual._replace(settings=bold), cam_T_grip)
+    assert 0.2 < risky.position_m / foreseen.absolute.position_m < 0.9
 
 
 def test_a_gripper_file_that_is_known_less_well_promises_less():
     usual, cam_T_grip = rig()
-    promised = []
+    bounds_m = []
     for sigma_m in (0.0, 1e-4, 5e-4):
         rough = usual._replace(settings=msgspec.structs.replace(usual.settings, model_sigma_m=sigma_m))
-        promised.append(forecast_frame(rough, cam_T_grip, None).protection.position_m)
-    assert promised[0] <= promised[1] < promised[2] and promised[2] > 2.0 * promised[1]
+        bounds_m.append(bound_of(rough, cam_T_grip).position_m)
+    assert bounds_m[0] <= bounds_m[1] < bounds_m[2] and bounds_m[2] > 2.0 * bounds_m[1]
 
 
 def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
@@ -89,7 +94,7 @@ def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
     assert set(found) == {"position_m", "rotation_rad", "risk", "hypothesis"} and found["risk"] == 1e-5
     (line,) = re.findall(r"^promise    (.*)$", text, re.MULTILINE)
     assert line.startswith(f"forecast: a transform of this view is good to {1e3 * found['position_m']:.2g} mm and ")
-    assert line.endswith("(risk 1e-05 a frame); alert limit 1 mm, 2 degrees: reachable")
+    assert line.endswith(", alert limit 1 mm and 2°")
 
 
 @pytest.mark.parametrize(
@@ -136,14 +141,14 @@ def test_a_size_that_is_known_less_well_promises_less(tmp_path: Path, capsys: py
     """A larger gripper farther away gives the same image: normal errors of the distance, at the stated risk."""
     usual, cam_T_grip = rig()
     model = msgspec.structs.replace(usual.gripper.model, scale_sigma=0.01)
-    foreseen = forecast_frame(usual._replace(gripper=Gripper(model)), cam_T_grip, None).protection
+    foreseen = bound_of(usual._replace(gripper=Gripper(model)), cam_T_grip)
     assert foreseen.position_m == pytest.approx(4.42 * 0.01 * np.linalg.norm(cam_T_grip[:3, 3]), rel=0.1)
     file = DEMO.parent / "grippers" / "two_box_fingers.yaml"
     (tmp_path / "gripper.yaml").write_text(f"{file.read_text()}\nscale_sigma: 0.01\n")
     path = tmp_path / "config.yaml"
     path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
     assert main(["check", str(path)]) == 0
-    assert "valid needs its size measured better (a length, a plate: scale_sigma" in capsys.readouterr().out
+    assert "what helps most: its size measured better (a length, a plate: scale_sigma" in capsys.readouterr().out
 
 
 def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():
@@ -153,7 +158,7 @@ def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():
         edge["bevel_m"] = 2e-4
     stated = usual._replace(gripper=gripper_from_dict(model))
     assumed = usual._replace(gripper=with_bevels(usual.gripper, 2e-4))
-    bounds = [forecast_frame(each, cam_T_grip, None).protection for each in (stated, assumed, usual)]
+    bounds = [bound_of(each, cam_T_grip) for each in (stated, assumed, usual)]
     assert bounds[0] == bounds[1] and bounds[1].position_m > 2.0 * bounds[2].position_m
 
 
@@ -167,7 +172,7 @@ def test_bevels_that_are_stated_but_not_taught_ask_for_teaching_and_not_for_anot
     (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(model))
     path = tmp_path / "config.yaml"
     path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
-    needed = r"valid needs its bevels taught \(gripmon teach\), or alert_limit_m of at least 0\.00"
+    needed = r"valid needs alert_limit_m of at least 0\.00.*; what helps most: its bevels taught \(gripmon teach\)"
     assert main(["check", str(path)]) == 0
     assert re.search(f"WARN  promise .*no transform can be valid: .*{needed}", capsys.readouterr().out)
     assert re.search(needed, limits_warning(load_config(path)) or "")
@@ -181,7 +186,7 @@ def test_a_limit_that_can_not_be_kept_is_said_by_check_and_sweep(tmp_path: Path,
     assert main(["check", str(path), "--verbose"]) == 0
     text = capsys.readouterr().out
     found = re.search(
-        r"^promise .* is good to ([\d.]+) mm .*NOT reachable: valid needs alert_limit_m of at least ([\d.e-]+) \(",
+        r"^promise .* is good to ([\d.]+) mm .*: valid needs alert_limit_m of at least ([\d.e-]+) \(",
         text,
         re.M,
     )
@@ -189,8 +194,8 @@ def test_a_limit_that_can_not_be_kept_is_said_by_check_and_sweep(tmp_path: Path,
     assert re.search(r"no transform is valid from 0.0 to 60.0 mm: bounds of up to", text)
     assert main(["check", str(path), "--sweep", "--distance", "0.1188", "--tilt", "31", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
-    assert not present["works"] and "needs alert_limit_m of at least" in present["reasons"][0]
-    assert present["protection"]["position_m"] > 2e-5
+    assert not present["works"] and "needs alert_limit_m of at least" in present["faults"][0]["text"]
+    assert present["accuracy"]["absolute"]["position_m"] > 2e-5
 
 
 def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -7,7 +7,6 @@ import json
 import re
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -22,7 +21,7 @@ from gripmon.analyse.comparison import Differences
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
-from gripmon.daemon.recorded_run import RecordedRun, as_recorded_before_bounds, one_recording
+from gripmon.daemon.recorded_run import one_recording
 from gripmon.daemon.replaying import replay
 from gripmon.io.sources.files import FolderSettings, FolderSource
 from gripmon.model.records import (
@@ -31,8 +30,6 @@ from gripmon.model.records import (
     AlertKind,
     Cause,
     Frame,
-    Origin,
-    Protection,
     Refusal,
     Severity,
     Verdict,
@@ -316,28 +313,6 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         assert main(["replay", *map(str, inputs), "--out", "-"]) == code
         (line,) = capsys.readouterr().err.splitlines()
         assert expected in line
-
-
-def test_a_recording_from_before_protection_levels_is_compared_by_what_it_says():
-    bound = Protection(9e-4, 0.01, 1e-5, "an edge belongs to something else")
-    record = recorded.record(3, protection=bound, verdict=Verdict.SUSPECT, reason="the TCP may be 0.9 mm off")
-    then = as_recorded_before_bounds(record)
-    assert then.protection is None and then.reason is None and then.cam_T_grip == record.cam_T_grip
-    held = msgspec.structs.replace(record, source=Origin.HELD, reason="hidden")
-    assert as_recorded_before_bounds(held).reason == "hidden"
-    run = RecordedRun.__new__(RecordedRun)
-    run.source = SimpleNamespace(passed_over=0, images_damaged=0, record=then)
-    run._differences, run._unbounded, run.recorded_config = Differences(), 0, None
-    run.compare(record)
-    assert run.summary() == (
-        "all 1 as they were recorded, every number the same; "
-        "1 frames were recorded by a version without protection levels"
-    )
-    run.source.record = msgspec.structs.replace(then, rms_px=9.0)
-    run.compare(record)
-    assert run.summary().startswith(
-        "verdicts, states and alerts of all 2 frames as recorded; numbers differ in 1, the TCP by up to 0 mm; "
-    )
 
 
 def test_a_replay_says_first_what_it_judges_otherwise():

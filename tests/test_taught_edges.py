@@ -223,7 +223,7 @@ def points_on(lines: list[tuple[float, float, float]], rng: np.random.Generator,
         parts.append((way[shown], offset_px[shown], np.arange(profiles)[shown]))
     way, offset_px, profile = (np.concatenate(part) for part in zip(*parts, strict=True))
     none = np.zeros(len(way), dtype=np.intp)
-    return EdgePoints(way, offset_px, np.ones(len(way)), profile, none, np.arange(len(way)), np.array([profiles]))
+    return EdgePoints(way, offset_px, np.ones(len(way)), profile, none, np.array([profiles]))
 
 
 def test_a_line_is_found_among_strays_wherever_it_lies():

@@ -228,7 +228,7 @@ def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest
     # A sweep looks with the same edges.
     assert main(["check", str(rig / "config.yaml"), "--sweep", "--distance", "0.12", "--tilt", "30", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
-    assert present["sigma"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
+    assert present["accuracy"]["expected"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
     assert main(["check", str(rig / "untaught.yaml"), "--verbose"]) == 0
     assert "gripmon teach" in capsys.readouterr().out
 
@@ -391,7 +391,7 @@ def test_a_missing_file_is_refused(rig: Path):
 
 METRES = st.floats(-0.02, 0.02)
 DEVIATIONS = st.floats(0.0, 0.02)
-LOOKS: st.SearchStrategy[object] = st.none() | st.builds(dict, level=st.floats(0.0, 1e3), spread=st.floats(0.0, 1e3))
+GREYS: st.SearchStrategy[object] = st.none() | st.builds(dict, level=st.floats(0.0, 1e3), spread=st.floats(0.0, 1e3))
 EDGES = st.fixed_dictionaries(
     {
         "share": st.tuples(st.floats(0.0, 0.4), st.floats(0.5, 1.0)),
@@ -403,8 +403,8 @@ EDGES = st.fixed_dictionaries(
         "brighter": st.sampled_from(["left", "right", "any"]),
         "rms_px": st.floats(0.0, 1e3),
         "seen": st.floats(0.0, 1.0),
-        "left": LOOKS,
-        "right": LOOKS,
+        "left": GREYS,  # of earlier versions
+        "right": GREYS,
     }
 )
 NAMES = st.text(

@@ -29,11 +29,12 @@ from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor
-from gripmon.teach.accuracy import forecast_accuracy
+from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.corner_pose import PoseRefused, place, pose_from_corners, usual_view
 from gripmon.teach.inset import unstated_inset_m
 from gripmon.teach.session import Setup
 from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig as Viewed
 from gripmon.track.edges.taught import gripper_digest
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
@@ -165,9 +166,11 @@ def test_what_is_expected_is_what_check_says(rig: Rig, setup: Setup):
     assert found.reference is not None and found.expected is not None
     # As of the configuration that is saved then, which names what this image teaches.
     _, taught = setup.taught(found.reference, [TeachingImage(rig.image, found.snapped.jaw_opening_m, "")])
-    expected = forecast_accuracy(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M, taught)
-    np.testing.assert_allclose(found.expected.sigma, expected.sigma)
-    assert min(found.expected.smallest) > 0.0 and found.expected.edges == expected.edges
+    known = Viewed(rig.camera, rig.gripper, MonitorSettings(), taught)
+    expected = forecast_frame(known, from_record(found.reference.cam_T_grip), OPENING_M)
+    shown = found.expected.accuracy
+    np.testing.assert_allclose(shown.expected.array, expected.expected.array)
+    assert min(shown.drift.smallest.array) > 0.0 and shown.edges == expected.edges
 
 
 @pytest.mark.slow("11 s: sampled; the corners' spread is in the default run")

@@ -362,7 +362,7 @@ def test_an_answer_says_what_a_transform_may_promise(served: PageServer, rig: Ri
     status, reply = look(served, {"corners": corners, "by_hand": list(corners), "image": 0})
     assert status == 200 and reply["expected"]["reachable"] is False
     assert re.match(
-        r"forecast: a transform of this view is good to [\d.]+ mm .*; alert limit 1 mm, 2 degrees: NOT reachable: ",
+        r"forecast: a transform of this view is good to .* mm .*, alert limit 1 mm and 2°; no transform can be valid: ",
         reply["expected"]["promise"],
     )
     assert b'id="promise"' in ask(served)[2] and b"#promise" in ask(served, "panel.js")[2]

@@ -19,6 +19,7 @@ from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
+from gripmon.teach.jaw_travel import over_jaw
 from gripmon.teach.visibility import (
     FEWEST_CORNERS,
     Freedom,
@@ -27,7 +28,6 @@ from gripmon.teach.visibility import (
     border,
     freedom,
     moved_camera,
-    over_jaw,
     see,
 )
 from gripmon.track.edges.prediction import BORDER_PX, lay_out

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 from gripmon.model.units import in_degrees, in_mm
 
 if TYPE_CHECKING:
-    from gripmon.daemon import forecast_values as forecasts
+    from gripmon.daemon import forecast as forecasts
     from gripmon.daemon.findings import Finding, Surroundings
     from gripmon.io.wire import Joining
+    from gripmon.teach import accuracy as expected
+    from gripmon.teach import jaw_travel
 
 _POORLY = 2.0  # growth of the standard deviation without a known opening above which the two are hardly separable
 _JAW_ERROR_M = 1e-5  # the error of the opening whose effect is printed
@@ -53,7 +55,7 @@ def details(report: forecasts.Forecast) -> list[str]:
     width = max(len(corner.id) for corner in report.corners)
     lines += [_corner_line(corner, width) for corner in report.corners]
     lines += _accuracy_lines(report.accuracy)
-    lines.append(f"promise    {report.promise}")
+    lines.append(f"promise    forecast: {report.promise}")
     view = report.in_view
     return [*lines, *_border_lines(view), *_camera_lines(view), *_jaw_lines(view.jaw_travel)]
 
@@ -98,16 +100,16 @@ def _corner_line(corner: forecasts.CornerView, width: int) -> str:
     return f"           {corner.id:<{width}} {place} px  {1e3 * corner.distance_m:6.1f} mm  {reason}".rstrip()
 
 
-def _accuracy_lines(values: forecasts.Accuracy) -> list[str]:
-    edges, expected, weakest = values.edges, values.expected, values.weakest
-    if expected is None or weakest is None:
+def _accuracy_lines(values: expected.Accuracy) -> list[str]:
+    edges, sigma, weakest = values.edges, values.expected, values.weakest
+    if sigma is None or weakest is None:
         accuracy = [f"accuracy   NONE: {edges} edges can be sampled, at least {values.edges_needed} are needed"]
     else:
         way, sigma_px = values.measurement, values.edge_point_sigma_px
         turn = _degrees(weakest.rotation_rad)
         accuracy = [
             f"accuracy   standard deviations of a frame by {way}, {edges} edges seen to {sigma_px:g} px a point:",
-            f"           {_sigmas(expected)}",
+            f"           {_sigmas(sigma)}",
             f"weakest    TCP by {_mm(weakest.tcp_m)} mm while turned by {turn}°",
         ]
     jaw = [] if values.jaw is None else _jaw_accuracy_lines(values.jaw)
@@ -115,7 +117,7 @@ def _accuracy_lines(values: forecasts.Accuracy) -> list[str]:
     return [*accuracy, *jaw, *drift, f"new pose   {_recalibration_text(values.recalibration)}"]
 
 
-def _jaw_accuracy_lines(jaw: forecasts.JawAccuracy) -> list[str]:
+def _jaw_accuracy_lines(jaw: expected.JawAccuracy) -> list[str]:
     unknown, growth = jaw.unknown, jaw.growth
     shift_m = [_JAW_ERROR_M * v for v in jaw.pose_per_jaw_m.tcp_m]
     separates = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw.like}"
@@ -128,7 +130,7 @@ def _jaw_accuracy_lines(jaw: forecasts.JawAccuracy) -> list[str]:
     ]
 
 
-def _drift_lines(drift: forecasts.DriftForecast) -> list[str]:
+def _drift_lines(drift: expected.DriftForecast) -> list[str]:
     alarms, frames_per_s = drift.false_alarms_per_day, drift.frames_per_s
     lines = [
         f"drift      at most {alarms:g} false alarms a day at {frames_per_s:g} frames/s; where errors last for",
@@ -145,7 +147,7 @@ def _drift_lines(drift: forecasts.DriftForecast) -> list[str]:
     return lines
 
 
-def _recalibration_text(values: forecasts.RecalibrationForecast) -> str:
+def _recalibration_text(values: expected.RecalibrationForecast) -> str:
     if not values.possible:
         return f"NOT from corners in this view: {values.reason}; past the limit the reference stays"
     where = "in one plane (4 are needed)" if values.coplanar else "(6 are needed)"
@@ -161,7 +163,7 @@ def _recalibration_text(values: forecasts.RecalibrationForecast) -> str:
     return f"{text}; certain to {1e3 * sigma_m:.3f} mm: {asked}"
 
 
-def _sigmas(values: forecasts.PoseValues | forecasts.UnknownJaw) -> str:
+def _sigmas(values: expected.PoseValues | expected.UnknownJaw) -> str:
     x, y, z = (1e3 * v for v in values.tcp_m)
     a, b, c = (math.degrees(v) for v in values.rotation_rad)
     return f"TCP x {x:.3f}, y {y:.3f}, z {z:.3f} mm, turn about x {a:.3f}, y {b:.3f}, z {c:.3f}°"
@@ -217,7 +219,7 @@ def _span(amounts: Sequence[float | None], factor: float, sought: float) -> str:
     return f"{low}{low_amount} to {high}{high_amount}"
 
 
-def _jaw_lines(jaw: forecasts.JawTravelForecast | None) -> list[str]:
+def _jaw_lines(jaw: jaw_travel.JawTravel | None) -> list[str]:
     if jaw is None:
         return []
     low_mm, high_mm = 1e3 * jaw.from_m, 1e3 * jaw.to_m
@@ -228,7 +230,7 @@ def _jaw_lines(jaw: forecasts.JawTravelForecast | None) -> list[str]:
     return [seen, *gaps, *_certainty_lines(jaw.certainty)]
 
 
-def _certainty_lines(values: forecasts.OpeningCertainty) -> list[str]:
+def _certainty_lines(values: jaw_travel.OpeningCertainty) -> list[str]:
     from gripmon.daemon.findings import past_limit
 
     known = [(s, m) for m, s in zip(values.opening_m, values.worst_sigma_m, strict=True) if s is not None]

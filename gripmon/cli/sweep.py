@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gripmon.cli.common import Arguments, progress_bar, two_numbers
@@ -13,7 +14,6 @@ from gripmon.model.stopping import EXIT_DONE
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.daemon.sweeping import Sweep
-    from gripmon.model.camera import Camera
     from gripmon.teach.mounts import Trial
 
 ABOUT = """\
@@ -38,8 +38,10 @@ NAMES = (*_RANGES, "lens", "at", "jaw")
 
 def run(arguments: Arguments) -> int:
     """Evaluate the mounts, print the table."""
+    import msgspec
+
     from gripmon.daemon.config import load_config
-    from gripmon.daemon.sweeping import as_plain, make_grid, sweep, values_in
+    from gripmon.daemon.sweeping import sweep, values_in
 
     config = load_config(arguments.config[0], check_source=False)
     typed = {name: getattr(arguments, name) for name in _RANGES}
@@ -52,10 +54,8 @@ def run(arguments: Arguments) -> int:
     travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", two_numbers(arguments.jaw or "")
     if travel_m is None and arguments.jaw is not None:
         raise InputError(f"--jaw {arguments.jaw}: isn't a range; MIN:MAX in metres, within {travel}")
-    grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
-    with progress_bar(len(grid), "mount") as step:
-        swept = sweep(config, grid, place_px, travel_m, step)
-    arguments.answer(as_plain(swept), _as_text(swept))
+    swept = sweep(config, ranges, arguments.lens or (), at_px, travel_m, progress_bar)
+    arguments.answer(msgspec.to_builtins(swept), _as_text(config, swept))
     return EXIT_DONE
 
 
@@ -67,11 +67,10 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def _as_text(swept: Sweep) -> list[str]:
+def _as_text(config: Config, swept: Sweep) -> list[str]:
     """A table for a person: mm, degrees."""
-    config, grid, at_px, present, ranked = swept.config, swept.grid, swept.at_px, swept.present, swept.ranked
+    at_px, present, ranked = swept.tcp_at_px, swept.present, swept.mounts
     working = sum(trial.works for trial in ranked)
-    warn_mm = 1e3 * config.settings.monitor.policy.warn_m
     lines = [
         f"{config.path}: {len(ranked)} mounts tried, {working} would work",
         f"TCP        at ({at_px[0]:.1f}, {at_px[1]:.1f}) px in all of them",
@@ -80,11 +79,11 @@ def _as_text(swept: Sweep) -> list[str]:
         " " * 10 + "".join(unit.rjust(width) for _, unit, width in _COLUMNS),
     ]
     lines += [
-        f"{'best' if k == 0 and trial.works else '':<10}{_row(grid.rigs[trial.lens].camera, trial)}"
+        f"{'best' if k == 0 and trial.works else '':<10}{_row(trial)}"
         for k, trial in enumerate(ranked[:_SHOWN])
     ]
     place = sum(trial.rank < present.rank for trial in ranked)
-    lines.append(f"{'present':<10}{_row(config.camera, present)}")
+    lines.append(f"{'present':<10}{_row(present)}")
     better = f"{place} of those tried are" if place else "none of those tried is"
     lines.append(f"           {better} better than the present one")
     lines += [f"           present: {fault.text}" for fault in present.faults]
@@ -94,9 +93,9 @@ def _as_text(swept: Sweep) -> list[str]:
         "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
         "           worst opening; bound: on its error at the worst opening, compared with alert_limit_m;",
         "           detects: the smallest step detected along every axis; in: frames until",
-        f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
-        "           until too little is in view.  Not included: focus, light, obstacles, and what hides the fingers",
-        "           without being in the gripper file.",
+        f"           one of {1e3 * swept.warn_m:g} mm is; margin: corners to the image's border; shift: of the camera",
+        "           sideways until too little is in view.  Not included: focus, light, obstacles, and what hides the",
+        "           fingers without being in the gripper file.",
     ]
     if not config.gripper.faces:
         lines += [
@@ -111,7 +110,7 @@ def _as_text(swept: Sweep) -> list[str]:
 def _looked_at(config: Config, present: Trial) -> list[str]:
     """Which openings count, and how taught edges are used."""
     lines = []
-    low_mm, high_mm = 1e3 * present.openings_m[0], 1e3 * present.openings_m[-1]
+    low_mm, high_mm = 1e3 * present.jaw.opening_m[0], 1e3 * present.jaw.opening_m[-1]
     if high_mm > low_mm:
         usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
         lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
@@ -122,36 +121,33 @@ def _looked_at(config: Config, present: Trial) -> list[str]:
     return lines
 
 
-def _row(camera: Camera, trial: Trial) -> str:
-    mount, found = trial.mount, trial.measurable
-    angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
-    cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
-    cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
-    if found is not None:
-        cells += [_number(v, 1e3, 3) for v in found.frame.sigma[:3].tolist()]
-        bound_m = found.promise.protection.position_m
-        cells += [_number(found.worst_sigma_m, 1e3, 3), _number(bound_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
-        cells += ["never" if found.delay_frames is None else str(found.delay_frames)]
-        cells += [_number(found.margin_px, 1.0, 0), _number(found.shift_m, 1e3, 1)]
+def _row(trial: Trial) -> str:
+    angles = (math.degrees(v) for v in (trial.tilt_rad, trial.side_rad, trial.roll_rad))
+    cells = [f"{1e3 * trial.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{trial.focal_px:.0f}"]
+    cells += [str(min(trial.jaw.corners)), str(min(trial.jaw.edges)), f"{100.0 * trial.jaw.share:.0f}"]
+    frame, promises = trial.accuracy, trial.promises
+    if frame is not None and frame.expected is not None and promises is not None:
+        cells += [_number(v, 1e3, 3) for v in frame.expected.tcp_m]
+        cells += [_number(v, 1e3, 3) for v in (trial.worst_sigma_m, promises.sizes.median_m, trial.noticed_m)]
+        cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
+        cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
     row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))
     return row if trial.works else f"{row}  NO: {trial.faults[0].text}"
 
 
-def _number(value: float, factor: float, digits: int) -> str:
-    scaled = factor * value
+def _number(value: float | None, factor: float, digits: int) -> str:
+    scaled = math.inf if value is None else factor * value
     return f"{scaled:.{digits if abs(scaled) < 10.0 or digits < 2 else 1}f}"
 
 
-def _failing(ranked: list[Trial]) -> list[str]:
+def _failing(ranked: Sequence[Trial]) -> list[str]:
     """The most common first reasons."""
     kinds = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
     return [f"{'' if k else 'others':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(kinds)]
 
 
 def _to_copy(best: Trial) -> list[str]:
-    from gripmon.model.geometry import to_record
-
-    transform = to_record(best.cam_T_grip)
+    transform = best.cam_T_grip
     return [
         "best as    reference:",
         "             cam_T_grip:",

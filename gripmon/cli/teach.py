@@ -125,7 +125,7 @@ def teach(arguments: Arguments) -> None:
         raise InputError("teach: --config is missing; a configuration, or --page with --camera and --gripper")
     arguments.refuse(_NEED_CORNERS, "goes with --page or --corners")
     from gripmon.daemon.config import load_config
-    from gripmon.daemon.teaching import name_taught
+    from gripmon.daemon.config.writing import name_taught
     from gripmon.teach.api import teach
 
     config, command = load_config(arguments.config, check_source=False, with_taught=False), arguments.command_line()

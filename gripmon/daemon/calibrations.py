@@ -21,6 +21,7 @@ from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import foreign_camera, read_camera
 from gripmon.daemon.config.checks import covariance_of
+from gripmon.daemon.config.project import files_of
 from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import kind_of, read_document, read_settings, read_yaml
 from gripmon.daemon.robot_file import is_robot_reference, reference_values, robot_reference
@@ -262,6 +263,7 @@ def view_in(
     ``rough``: distance (m) of the TCP, which is in the middle of the image, and tilt of the optical axis from the
     gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
+    camera, reference = files_of(camera=camera, reference=reference).values()
     cam_T_grip = None if reference is None else pose_in(reference)[0]
     lens = None if camera is None else camera_in(camera).lens
     if lens is None and reference is not None:
@@ -272,7 +274,7 @@ def view_in(
         raise InputError("is missing: a rough view needs one; a file of gripmon calibrate intrinsics", "camera")
     made = make_camera(lens)
     middle = 0.5 * (made.width_px - 1.0), 0.5 * (made.height_px - 1.0)
-    return made, Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).cam_T_grip(towards(made, middle))
+    return made, Mount(rough[0], math.radians(rough[1]), 0.0, 0.0).pose(towards(made, middle))
 
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
@@ -321,6 +323,7 @@ def plane_inputs(
     """Read the files; a configuration supplies camera, gripper, jaw opening and rough calibration if they are not
     given. ``infer``: the gripper is unknown.  :class:`~gripmon.model.errors.InputError`.
     """
+    camera, config, gripper = files_of(camera=camera, config=config, gripper=gripper).values()
     files = [path for path in (camera, config, gripper, *corners) if path is not None]
     loaded = None if config is None else load_config(config, check_source=False, with_taught=False)
     if loaded is not None:

@@ -10,30 +10,33 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
 
 from gripmon.daemon.api import look_ahead
 from gripmon.daemon.config import Config, check_network, load_config
-from gripmon.daemon.forecast import forecast
-from gripmon.daemon.forecast_values import (
+from gripmon.daemon.forecast import (
     CameraValues,
     Forecast,
     GripperValues,
     InView,
-    JawTravelForecast,
     JawValues,
-    OpeningCertainty,
-    RecalibrationForecast,
     ReferenceValues,
+    forecast,
 )
-from gripmon.daemon.promised import Level, by_forecast, images_of, kept_of, over_images, picture_of
+from gripmon.daemon.promised import images_of, kept_of, picture_of
 from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Joining, Keys
-from gripmon.teach.kept import Kept
+from gripmon.model.gripper import UNTOLD_BEVEL_M
+from gripmon.model.units import in_degrees, in_mm
+from gripmon.teach.accuracy import RecalibrationForecast
+from gripmon.teach.jaw_travel import JawTravel, OpeningCertainty
+from gripmon.teach.kept import USUAL_SPREAD, Kept
+
+Level = Literal["OK", "WARN", "FAIL"]
 
 _NOT_SQUARE = 0.02
 """Largest difference of fx / fy from 1 in a calibration of a sensor with square pixels (no unit)."""
@@ -247,11 +250,26 @@ def _view(in_view: InView, gripper: GripperValues, measured: int) -> Finding:
 
 
 def _promise(report: Forecast, found: Kept | None, what: str) -> Finding | None:
-    said = by_forecast(report) if found is None else over_images(found, what)
-    return None if said is None else Finding(said[0], "promise", said[1])
+    """By images, else by the forecast; None where nothing is in view, which the line about the view says."""
+    if found is not None:
+        text = f"over {what}: {found.promise() if found.images else 'none can be read'}"
+        return Finding("OK" if found.reachable else "WARN", "promise", text)
+    bound, bevelled = report.protection, report.protection_if_bevelled
+    if bound is None:
+        return None
+    limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
+    sure = max(bound.position_m / limit_m, bound.rotation_rad / limit_rad) * USUAL_SPREAD <= 1.0
+    text = f"forecast without images (--images gives what frames keep): {report.promise}"
+    if report.reachable and bevelled and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
+        good, sure = f"{in_mm(bevelled.position_m)} mm and {in_degrees(bevelled.rotation_rad)}°", False
+        text += (
+            f"; so if all edges are as sharp as the gripper file says, to {good} with bevels of "
+            f"{in_mm(UNTOLD_BEVEL_M)} mm: teach them (gripmon teach), or state them (bevel_m)"
+        )
+    return Finding("OK" if sure else "WARN", "promise", text)
 
 
-def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:
+def _jaw_travel(travel: JawTravel | None, jaw: JawValues) -> Finding | None:
     if travel is None:
         return None
     if jaw.source == "fixed" and jaw.opening_m is not None:

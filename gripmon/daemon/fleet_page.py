@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon import __version__
 from gripmon.client import Ambiguous, Condition, Fleet, MonitorName, MonitorStatus, NotCarriedOut, trouble
 from gripmon.daemon.mount import MountView, view_of
 from gripmon.daemon.overlay import picture_of
@@ -72,7 +71,6 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     reference_id: str = ""
     revision: int = -1
     proposal_id: str = ""
-    version: str = ""
     alerts: tuple[StandingAlert, ...] = ()
     more_alerts: int = 0
 
@@ -82,7 +80,6 @@ class FleetView(msgspec.Struct, frozen=True, kw_only=True):
     more match.
     """
 
-    version: str
     stamp_ns: int
     fault: str
     counts: dict[Condition, int]
@@ -134,7 +131,6 @@ class FleetSite:
         found = sorted((each for each in monitors if find.lower() in str(each.name).lower()), key=trouble)
         fault = [f"{self._fleet.unreadable} messages can't be read"] if self._fleet.unreadable else []
         return FleetView(
-            version=__version__,
             stamp_ns=time.time_ns(),
             fault="; ".join(filter(None, [self._fleet.fault(), *fault])),
             counts=dict(Counter(each.condition for each in monitors)),
@@ -234,7 +230,6 @@ def _card(status: MonitorStatus) -> Card:
         reference_id=_short(state.reference_id),
         revision=state.revision,
         proposal_id=state.proposal_id if len(state.proposal_id) <= _LONGEST_TEXT else "",
-        version=_short(state.version),
         alerts=tuple(msgspec.structs.replace(each, text=_short(each.text)) for each in alerts[:_ALERTS_SHOWN]),
         more_alerts=max(0, len(alerts) - _ALERTS_SHOWN),
     )

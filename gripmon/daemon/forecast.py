@@ -3,69 +3,160 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.checks import reference_doubt
-from gripmon.daemon.forecast_values import (
-    Accuracy,
-    CameraValues,
-    CornerView,
-    DriftForecast,
-    EdgeView,
-    FarthestEdge,
-    Forecast,
-    GripperValues,
-    InView,
-    JawAccuracy,
-    JawTravelForecast,
-    JawValues,
-    OpeningCertainty,
-    PoseValues,
-    RecalibrationForecast,
-    ReferenceValues,
-    TaughtValues,
-    UnknownJaw,
-)
-from gripmon.judge.drift import CORRELATION_FRAMES, foresee
-from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
 from gripmon.model.gripper import UNTOLD_BEVEL_M, Gripper
 from gripmon.model.records import Protection
-from gripmon.monitor import CORNER_COUNTS
-from gripmon.teach.accuracy import (
-    EDGE_POINT_SIGMA_PX,
-    AccuracyForecast,
-    Promise,
-    UnknownOpening,
-    accuracy_over_jaw,
-    as_if_measured,
-    as_if_taught,
-    forecast_accuracy,
-    forecast_frame,
-    with_bevels,
-)
+from gripmon.teach.accuracy import Accuracy, Vector, as_if_taught, forecast_frame, with_bevels
 from gripmon.teach.inset import made_from_images
+from gripmon.teach.jaw_travel import JawTravel, over_jaw
+from gripmon.teach.kept import Kept, promise_of
 from gripmon.teach.mounts import Mount
-from gripmon.teach.visibility import (
-    FEWEST_CORNERS,
-    Rig,
-    border,
-    freedom,
-    over_jaw,
-    see,
-)
+from gripmon.teach.visibility import FEWEST_CORNERS, Border, Freedom, Rig, border, freedom, see
 from gripmon.track.edges.kernel import FEWEST_EDGES
 
-__all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
+__all__ = ["Forecast", "forecast", "limits_warning", "rig_of"]
 
-_DIRECTIONS = (
-    "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
-)  # fmt: skip
-_STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is given
+
+class CameraValues(msgspec.Struct, frozen=True):
+    """The lens and its field of view (rad)."""
+
+    model: str
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    field_of_view_rad: tuple[float, float]
+
+
+class GripperValues(msgspec.Struct, frozen=True):
+    """The gripper file and its counts; ``jaw_m``: the jaw's travel, None without a jaw; ``apart_rate``: by how much two
+    fingers move apart for each metre of opening, None for other numbers of fingers.
+    """
+
+    file: str
+    name: str
+    corners: int
+    edges: int
+    faces: int
+    notes: tuple[str, ...]
+    jaw_m: tuple[float, float] | None
+    apart_rate: float | None = None
+
+
+class ReferenceValues(msgspec.Struct, frozen=True):
+    """The reference calibration, and values that reveal a mistake in it."""
+
+    id: str
+    translation_m: Vector
+    rotation_xyzw: tuple[float, float, float, float]
+    distance_m: float
+    turn_rad: float
+    metres_per_px: float
+    tilt_rad: Annotated[float, Meta(description="of the optical axis against the fingers")]
+    camera_ahead_m: Annotated[float, Meta(description="of the TCP, along the gripper's z axis")]
+    sound_as_wxyz: Annotated[bool, Meta(description="read as w, x, y, z it would be behind the fingertips, in view")]
+
+
+class FarthestEdge(msgspec.Struct, frozen=True):
+    """The taught edge with the largest offset from the sharp model."""
+
+    edge: str
+    offset_m: float
+    offset_px: float
+
+
+class TaughtValues(msgspec.Struct, frozen=True):
+    """The taught model."""
+
+    file: str
+    time: str
+    images: int
+    edges: tuple[str, ...]
+    largest: FarthestEdge
+
+
+class JawValues(msgspec.Struct, frozen=True):
+    """The source of the jaw opening, and the opening of all predictions (m)."""
+
+    source: str
+    opening_m: float | None
+    nominal: bool
+
+
+class CornerView(msgspec.Struct, frozen=True):
+    """A corner predicted by the calibration."""
+
+    id: str
+    uv_px: tuple[float, float] | None
+    distance_m: float
+    visible: bool
+    reason: str | None
+
+
+class EdgeView(msgspec.Struct, frozen=True):
+    """Whether an edge is visible."""
+
+    id: str
+    visible: bool
+
+
+class InView(msgspec.Struct, frozen=True):
+    """What is visible, its distance from the image border, and how far camera and jaws may move."""
+
+    corners: int
+    edges: int
+    corners_needed: int
+    edges_needed: int
+    enough: bool
+    reason: str | None
+    behind_another_finger: tuple[str, ...]
+    border: Border | None
+    camera_may_move: Freedom | None
+    limit_m: float
+    jaw_travel: JawTravel | None
+
+
+class Forecast(msgspec.Struct, frozen=True):
+    """The forecast of a configuration's view: metres, radians, px; positions in the camera frame.
+
+    ``protection``: the protection level of one frame, which ``valid_by`` names: that of the motion ``since_reference``,
+    before the reference's frames are averaged, or the ``absolute`` one; ``protection_if_bevelled``: the same if the
+    gripper has bevels that are neither stated nor taught, null if that is excluded; ``promise`` says it beside the
+    alert limits, ``needed``: those that this view could meet, if no transform of it can be valid; ``doubt``: why what
+    is valid by its absolute error may be farther off, null if nothing says so.
+    """
+
+    config: str
+    robot: str
+    camera_name: str
+    camera: CameraValues
+    gripper: GripperValues
+    reference: ReferenceValues
+    taught: TaughtValues | None
+    jaw: JawValues
+    corners: tuple[CornerView, ...]
+    edges: tuple[EdgeView, ...]
+    accuracy: Accuracy
+    valid_by: str
+    protection: Protection | None
+    since_reference: Protection | None
+    absolute: Protection | None
+    protection_if_bevelled: Protection | None
+    alert_limit_m: float
+    alert_limit_rad: float
+    reachable: bool
+    needed: str | None
+    promise: str
+    in_view: InView
+    doubt: str | None
 
 
 def forecast(config: Config) -> Forecast:
@@ -74,9 +165,10 @@ def forecast(config: Config) -> Forecast:
     A view that shows too little isn't an error: ``in_view.reason`` says what is missing, and values that need more are
     None.
     """
-    settings, gripper, found = config.settings, config.gripper, promise_of(config)
-    both = None if found is None else forecast_frame(rig_of(config), config.cam_T_grip, config.jaw_opening_m).bounds
-    policy = settings.monitor.policy
+    settings, gripper, rig = config.settings, config.gripper, rig_of(config)
+    policy, in_view = settings.monitor.policy, _in_view(config, rig)
+    accuracy = forecast_frame(rig, config.cam_T_grip, config.jaw_opening_m, with_jaw=True)
+    found = _promise_of(config, rig, accuracy) if in_view.enough else None
     return Forecast(
         config=str(config.path),
         robot=settings.robot,
@@ -92,23 +184,23 @@ def forecast(config: Config) -> Forecast:
             jaw_m=(gripper.jaw_min_m, gripper.jaw_max_m) if gripper.has_jaw else None,
             apart_rate=_apart_rate(gripper),
         ),
-        reference=_reference(config),
+        reference=_reference(config, rig),
         taught=_taught(config),
         jaw=JawValues(settings.jaw.source, config.jaw_opening_m, settings.jaw.opening_m is None),
         corners=_corners(config),
         edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
-        accuracy=_accuracy(config),
+        accuracy=accuracy,
         valid_by=policy.valid_by,
-        protection=None if found is None else found.protection,
-        since_reference=None if both is None else both.since_reference,
-        absolute=None if both is None else both.absolute,
-        protection_if_bevelled=None if found is None else _if_bevelled(config),
+        protection=None if found is None else accuracy.by(policy.valid_by),
+        since_reference=None if found is None else accuracy.since_reference,
+        absolute=None if found is None else accuracy.absolute,
+        protection_if_bevelled=None if found is None else _if_bevelled(config, rig),
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
         reachable=found is not None and found.reachable,
-        needed=None if found is None or found.reachable else found.needed,
-        promise="nothing: too little is in view" if found is None else found.text(),
-        in_view=_in_view(config),
+        needed=None if found is None or found.reachable else found.needed(),
+        promise="nothing: too little is in view" if found is None else found.promise(),
+        in_view=in_view,
         doubt=reference_doubt(settings),
     )
 
@@ -134,41 +226,27 @@ def rig_once_taught(config: Config) -> Rig:
     return rig._replace(gripper=as_if_taught(rig.gripper)) if rig.taught is None else rig
 
 
-def promise_of(config: Config) -> Promise | None:
-    """The promised accuracy at the configured pose and opening; None if too little is visible for a measurement."""
-    rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
-    if not see(rig, cam_T_grip, opening_m).enough:
-        return None
-    policy = config.settings.monitor.policy
-    found = Promise.of(forecast_frame(rig, cam_T_grip, opening_m).protection, policy)
-    if found.reachable:
-        return found
-    remedies = [
-        words
-        for words, known in as_if_measured(rig).items()
-        if Promise.of(forecast_frame(known, cam_T_grip, opening_m).protection, policy).reachable
-    ]
-    return replace(found, remedies=tuple(remedies))
+def _promise_of(config: Config, rig: Rig, accuracy: Accuracy | None = None) -> Kept:
+    return promise_of(rig, config.cam_T_grip, config.jaw_opening_m, accuracy)
 
 
 def limits_warning(config: Config) -> str | None:
-    """A warning if no transform of the configured view can be valid; None otherwise."""
-    found = promise_of(config)
-    if found is None or found.reachable:
+    """A warning if no transform of the configured view can be valid; None otherwise, also if too little is visible."""
+    rig = rig_of(config)
+    if not see(rig, config.cam_T_grip, config.jaw_opening_m).enough or (found := _promise_of(config, rig)).reachable:
         return None
-    told = f"by the forecast no transform of this view can be valid: valid needs {found.needed}"
-    return f"{config.path}: {told} (monitor.policy)"
+    told = f"by the forecast no transform of this view can be valid: valid needs {found.needed()}"
+    return "; ".join(filter(None, [f"{config.path}: {told} (monitor.policy)", found.help()]))
 
 
-def _if_bevelled(config: Config) -> Protection | None:
+def _if_bevelled(config: Config, rig: Rig) -> Protection | None:
     """The protection level if no edge is sharp; None if edges are known as they appear, because they were taught or the
     gripper file was made from images, or if the file is stated to be exact.
     """
-    rig = rig_of(config)
     if rig.taught is not None or made_from_images(rig.gripper) or rig.settings.model_sigma_m == 0.0:
         return None
     bevelled = rig._replace(gripper=with_bevels(rig.gripper, UNTOLD_BEVEL_M))
-    return forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).protection
+    return forecast_frame(bevelled, config.cam_T_grip, config.jaw_opening_m).by(rig.settings.policy.valid_by)
 
 
 def _camera(config: Config) -> CameraValues:
@@ -179,7 +257,7 @@ def _camera(config: Config) -> CameraValues:
     return CameraValues(str(model), camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, (across, down))
 
 
-def _reference(config: Config) -> ReferenceValues:
+def _reference(config: Config, rig: Rig) -> ReferenceValues:
     reference, cam_T_grip = config.reference, config.cam_T_grip
     return ReferenceValues(
         id=reference.reference_id,
@@ -190,18 +268,18 @@ def _reference(config: Config) -> ReferenceValues:
         metres_per_px=float(cam_T_grip[2, 3]) / config.camera.fx_px,
         tilt_rad=Mount.of(cam_T_grip).tilt_rad,
         camera_ahead_m=float(invert(cam_T_grip)[2, 3]),
-        sound_as_wxyz=_sound_as_wxyz(config),
+        sound_as_wxyz=_sound_as_wxyz(config, rig),
     )
 
 
-def _sound_as_wxyz(config: Config) -> bool:
+def _sound_as_wxyz(config: Config, rig: Rig) -> bool:
     """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips with a
     view of them.
     """
     w, x, y, z = config.reference.cam_T_grip.rotation_xyzw
     cam_T_grip = make_transform(rotation_from_xyzw((x, y, z, w)), config.cam_T_grip[:3, 3])
     behind = float(invert(cam_T_grip)[2, 3]) < 0.0
-    return behind and see(rig_of(config), cam_T_grip, config.jaw_opening_m).enough
+    return behind and see(rig, cam_T_grip, config.jaw_opening_m).enough
 
 
 def _taught(config: Config) -> TaughtValues | None:
@@ -231,72 +309,10 @@ def _corners(config: Config) -> tuple[CornerView, ...]:
     )
 
 
-def _accuracy(config: Config) -> Accuracy:
-    settings = config.settings.monitor
-    expected = forecast_accuracy(
-        config.camera, config.gripper, settings, config.reference, config.jaw_opening_m, config.taught_edges
-    )
-    enough, jaw = expected.enough, expected.jaw
-    return Accuracy(
-        measurement=settings.measurement,
-        edges=expected.edges,
-        edges_needed=FEWEST_EDGES,
-        corners=int(np.count_nonzero(expected.corners)),
-        edge_point_sigma_px=EDGE_POINT_SIGMA_PX,
-        recalibration=_recalibration(config, expected),
-        expected=PoseValues.of(expected.sigma) if enough else None,
-        weakest=PoseValues.of(expected.weakest) if enough else None,
-        jaw=None if jaw is None or not enough else _jaw_accuracy(jaw, expected.lever_m, settings.jaw_sigma_m),
-        drift=_drift(config, expected) if enough else None,
-    )
-
-
-def _jaw_accuracy(jaw: UnknownOpening, lever_m: float, reported_sigma_m: float) -> JawAccuracy:
-    per_m = [abs(v) * (1.0 if k < 3 else lever_m) for k, v in enumerate(jaw.pose_per_m.tolist())]
-    unknown = PoseValues.of(jaw.sigma)
-    return JawAccuracy(
-        reported_sigma_m=reported_sigma_m,
-        unknown=UnknownJaw(unknown.tcp_m, unknown.rotation_rad, jaw.sigma_m),
-        pose_per_jaw_m=PoseValues.of(jaw.pose_per_m),
-        like=_DIRECTIONS[per_m.index(max(per_m))],
-        correlation=float(jaw.correlation),
-        growth=jaw.growth,
-    )
-
-
-def _drift(config: Config, expected: AccuracyForecast) -> DriftForecast:
-    settings = config.settings.monitor.drift
-    detectable = foresee(expected.covariance, settings)
-    delays: Any = {f"{m:g}": tuple(detectable.delay_frames(m, axis) for axis in range(3)) for m in _STEPS_M}
-    return DriftForecast(
-        settings.false_alarms_per_day,
-        settings.frames_per_s,
-        CORRELATION_FRAMES,
-        PoseValues.of(detectable.smallest),
-        delays,
-    )
-
-
-def _recalibration(config: Config, expected: AccuracyForecast) -> RecalibrationForecast:
-    """Judged by one frame: an average over frames with lasting errors is hardly more certain."""
-    gripper, settings = config.gripper, config.settings.monitor
-    taken = gripper.innermost_corners(expected.corners, CORNER_COUNTS[settings.recalibrate_corners])
-    points_grip_m = gripper.points_grip_m(config.jaw_opening_m)[gripper.corner_points][taken]
-    reason = refusal(points_grip_m)
-    return RecalibrationForecast(
-        corners=len(points_grip_m),
-        coplanar=bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
-        possible=reason is None,
-        reason=reason,
-        sigma_m=float(max(expected.sigma[:3])) if expected.enough else None,
-        sure_sigma_m=settings.recalibration.sure_sigma_m,
-        mode=settings.recalibration.mode,
-    )
-
-
-def _in_view(config: Config) -> InView:
-    rig, cam_T_grip = rig_of(config), config.cam_T_grip
-    sight = see(rig, cam_T_grip, config.jaw_opening_m)
+def _in_view(config: Config, rig: Rig) -> InView:
+    cam_T_grip, opening_m = config.cam_T_grip, config.jaw_opening_m
+    sight = see(rig, cam_T_grip, opening_m)
+    names = zip(rig.gripper.landmark_ids, sight.behind, strict=True)
     return InView(
         corners=sight.corners,
         edges=sight.edges,
@@ -304,36 +320,9 @@ def _in_view(config: Config) -> InView:
         edges_needed=FEWEST_EDGES,
         enough=sight.enough,
         reason=sight.reason,
-        behind_another_finger=tuple(
-            name for name, behind in zip(rig.gripper.landmark_ids, sight.behind, strict=True) if behind
-        ),
+        behind_another_finger=tuple(name for name, behind in names if behind),
         border=border(rig, sight),
-        camera_may_move=freedom(rig, cam_T_grip, config.jaw_opening_m) if sight.enough else None,
-        limit_m=config.settings.monitor.policy.limit_m,
-        jaw_travel=_jaw_travel(config, rig),
-    )
-
-
-def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
-    travel = over_jaw(rig, config.cam_T_grip)
-    if travel is None:
-        return None
-    certain = accuracy_over_jaw(rig, config.cam_T_grip)
-    policy = config.settings.monitor.policy
-    bounds = [None if each is None else each.protection for _, each in certain]
-    return JawTravelForecast(
-        share=travel.share,
-        gaps=travel.gaps,
-        corners=(int(travel.corners.min()), int(travel.corners.max())),
-        edges=(int(travel.edges.min()), int(travel.edges.max())),
-        from_m=config.gripper.jaw_min_m,
-        to_m=config.gripper.jaw_max_m,
-        certainty=OpeningCertainty(
-            opening_m=tuple(opening_m for opening_m, _ in certain),
-            worst_sigma_m=tuple(None if each is None else each.tcp_sigma_m for _, each in certain),
-            protection_m=tuple(None if b is None else b.position_m for b in bounds),
-            protection_rad=tuple(None if b is None else b.rotation_rad for b in bounds),
-            alert_limit_m=policy.alert_limit_m,
-            alert_limit_rad=policy.alert_limit_rad,
-        ),
+        camera_may_move=freedom(rig, cam_T_grip, opening_m) if sight.enough else None,
+        limit_m=rig.settings.policy.limit_m,
+        jaw_travel=over_jaw(rig, cam_T_grip),
     )

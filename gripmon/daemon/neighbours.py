@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from gripmon.model.records import Command, CommandError, CommandReply
@@ -32,7 +32,7 @@ class Commands(Protocol):
     def poll(self) -> Asked | None: ...
 
 
-@dataclass(frozen=True)
+@dataclass
 class Reports:
     """Values for the state message that the loop doesn't know itself; called in its thread, and must not block.
 
@@ -41,7 +41,7 @@ class Reports:
     other monitors with this name.
     """
 
-    faults: Sequence[Callable[[], str | None]] = ()
+    faults: list[Callable[[], str | None]] = field(default_factory=list)
     unsent: Callable[[], int] = int
     malformed: Callable[[], int] = int
     alert_limit_m: float | None = None

@@ -28,53 +28,92 @@ class NameTakenError(NoResultError):
     exit_code = 4
 
 
-@dataclasses.dataclass(frozen=True)
 class Network:
-    """The session (None: nothing is published), the outputs, the sources of the jaw opening (None: the frames) and
-    of commands, and the reports of all these for the state message.
+    """The session, ``link`` (None: nothing is published), the ``outputs``, the sources of the ``jaw`` opening (None:
+    the frames) and of ``commands``, and the ``reports`` of all these for the state message.
     """
 
-    link: Link | None
-    outputs: tuple[Output, ...] = ()
-    jaw: JawFeed | None = None
-    commands: Commands | None = None
-    reports: Reports = dataclasses.field(default_factory=Reports)
+    def __init__(self, config: Config, *, take_over: bool = False) -> None:
+        """Raises :class:`ConfigError` if it can't be opened as configured, and :class:`NameTakenError` if another
+        monitor has the same robot and camera name, unless ``take_over``.
+        """
+        settings, policy = config.settings, config.settings.monitor.policy
+        check_network(config)
+        self.link: Link | None = None
+        self.outputs: list[Output] = []
+        self.jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
+        self._heard: list[Commands] = []
+        self._arriving: list[ZenohJaw | ZenohCommands | ArrivingCamera] = []
+        self.reports = Reports(
+            malformed=lambda: sum(each.malformed for each in self._arriving),
+            alert_limit_m=policy.alert_limit_m,
+            alert_limit_rad=policy.alert_limit_rad,
+        )
+        with contextlib.ExitStack() as failed:
+            failed.callback(self.close)  # the process must not end while its session is being opened
+            if settings.publish.enabled:
+                self._join(config, take_over=take_over)
+            if settings.ros2.enabled:
+                node = Ros2Output(
+                    settings.ros2, settings.robot, settings.camera_name, commands=settings.publish.commands,
+                    others=self.reports.others,
+                )  # fmt: skip
+                self.outputs.append(node)
+                self._heard.append(node)
+                self.reports.faults.append(node.fault)
+            if settings.metrics.enabled:
+                self._serve_metrics(config)
+            failed.pop_all()
+
+    @property
+    def commands(self) -> Commands | None:
+        """Commands from all networks."""
+        return self if self._heard else None
+
+    def poll(self) -> Asked | None:
+        return next((asked for each in self._heard if (asked := each.poll()) is not None), None)
 
     def close(self) -> None:
         """Close the outputs, the link last."""
         for output in reversed(self.outputs):
             output.close()
+        if self.link is not None:
+            self.link.close()
 
+    def report_on(self, source: Source) -> None:
+        """Report also on a camera on a network."""
+        if isinstance(source, ArrivingCamera):
+            self._arriving.append(source)
+            self.reports.faults.append(source.fault)
 
-def open_network(config: Config, *, take_over: bool = False) -> Network:
-    """Open the network.  Raises :class:`ConfigError` if it can't be opened as configured, and :class:`NameTakenError`
-    if another monitor has the same robot and camera name, unless ``take_over``.
-    """
-    jaw = None
-    if config.settings.jaw.source == "fixed":
-        jaw = _FixedJaw(config.jaw_opening_m)
-    network = Network(None, jaw=jaw)
-    link = _open_link(config)
-    if link is not None:
+    def _join(self, config: Config, *, take_over: bool) -> None:
+        settings, reports = config.settings, self.reports
+        try:
+            self.link = link = Link(settings.publish, config.directory)
+        except PublishError as error:
+            raise ConfigError(config.path, "", str(error)) from None
+        presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
+        publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
+        self.outputs.append(publisher)
+        if settings.jaw.source == "zenoh":
+            travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
+            self.jaw = jaw = ZenohJaw(link, publisher.keys["jaw"], travel_m=travel_m)
+            self._arriving.append(jaw)
+        if settings.publish.commands:
+            commands = ZenohCommands(link, publisher.keys, presence)
+            self._heard.append(commands)
+            self._arriving.append(commands)
+        reports.faults.append(link.fault)
+        reports.unsent, reports.others = lambda: publisher.unsent, presence.others
+
+    def _serve_metrics(self, config: Config) -> None:
+        """For Prometheus.  Raises :class:`ConfigError` if the server can't listen."""
         settings = config.settings
-        with contextlib.ExitStack() as failed:
-            failed.callback(link.close)  # the process must not end while its session is being opened
-            presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
-            network = _on_link(config, link, jaw, presence)
-            failed.pop_all()
-    return _with_metrics(config, _with_ros2(config, network))
-
-
-def _open_link(config: Config) -> Link | None:
-    """The session, None if nothing is published."""
-    check_network(config)
-    settings = config.settings
-    if not settings.publish.enabled:
-        return None
-    try:
-        return Link(settings.publish, config.directory)
-    except PublishError as error:
-        raise ConfigError(config.path, "", str(error)) from None
+        try:
+            self.outputs.append(MetricsServer(settings.metrics, settings.robot, settings.camera_name))
+        except MetricsError as error:
+            raise ConfigError(config.path, "", str(error)) from None
+        _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
 
 
 def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
@@ -86,72 +125,6 @@ def _alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
         remedy = "stop it, give this one another name, or start it with --take-over and stop the other one then"
         raise NameTakenError(f"{in_words(others)}; {remedy}")
     return presence
-
-
-def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
-    settings = config.settings
-    publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
-    if settings.jaw.source == "zenoh":
-        jaw = ZenohJaw(link, publisher.keys["jaw"], travel_m=(config.gripper.jaw_min_m, config.gripper.jaw_max_m))
-    commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
-    heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
-    reports = Reports(
-        (link.fault,), lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
-    )
-    return Network(link, (publisher,), jaw, commands, reports)
-
-
-def _with_ros2(config: Config, network: Network) -> Network:
-    """Add the monitor as a node of ROS 2, if configured."""
-    settings, reports = config.settings, network.reports
-    if not settings.ros2.enabled:
-        return network
-    node = Ros2Output(
-        settings.ros2, settings.robot, settings.camera_name,
-        commands=settings.publish.commands, others=reports.others,
-    )  # fmt: skip
-    return dataclasses.replace(
-        network,
-        outputs=(*network.outputs, node),
-        commands=node if network.commands is None else _EitherCommands(network.commands, node),
-        reports=dataclasses.replace(reports, faults=(*reports.faults, node.fault)),
-    )
-
-
-class _EitherCommands:
-    """Commands from two networks."""
-
-    def __init__(self, *heard: Commands) -> None:
-        self._heard = heard
-
-    def poll(self) -> Asked | None:
-        return next((asked for each in self._heard if (asked := each.poll()) is not None), None)
-
-
-def _with_metrics(config: Config, network: Network) -> Network:
-    """Add the metrics server for Prometheus to the outputs if configured.  Raises :class:`ConfigError` if it can't
-    listen.
-    """
-    settings = config.settings
-    if not settings.metrics.enabled:
-        return network
-    try:
-        metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
-    except MetricsError as error:
-        network.close()
-        raise ConfigError(config.path, "", str(error)) from None
-    _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return dataclasses.replace(network, outputs=(*network.outputs, metrics))
-
-
-def with_source(reports: Reports, source: Source) -> Reports:
-    """The reports, extended by those of a camera on a network."""
-    if not isinstance(source, ArrivingCamera):
-        return reports
-    malformed = reports.malformed
-    return dataclasses.replace(
-        reports, faults=(*reports.faults, source.fault), malformed=lambda: malformed() + source.malformed
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,38 +1,31 @@
-"""What ``gripmon check`` promises: a monitor's own bounds over the images that there are, else the forecast."""
+"""The images that ``gripmon check`` judges a configuration by, and a monitor's own bounds over them."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 
 from gripmon.daemon.api import Monitor, open_configured, open_source
 from gripmon.daemon.config import Config
 from gripmon.daemon.forecast import rig_of
-from gripmon.daemon.forecast_values import Forecast
 from gripmon.io.sources import EpisodeSettings, FolderSettings, SourceSettings, VideoSettings, settings_for_path
 from gripmon.model.errors import InputError
-from gripmon.model.gripper import UNTOLD_BEVEL_M
 from gripmon.model.images import image_in
 from gripmon.model.records import Frame
-from gripmon.model.units import in_degrees, in_mm
 from gripmon.monitor import warm_up
 from gripmon.teach.drawing import draw_doubted
 from gripmon.teach.kept import APART_S, Kept, doubted_edges, kept, with_help
 from gripmon.teach.views import TeachingImage
-
-Level = Literal["OK", "WARN", "FAIL"]
+from gripmon.teach.visibility import Rig
 
 MOST_IMAGES = 100
 """Images that are taken, from the beginning: thirty settle where the reference's frames had the gripper, and the others
 show what a bound is then; a second or two of computing.
 """
-
-USUAL_SPREAD = 2.0
-"""Ratio of the bound to the predicted one that one frame in twenty reaches (no unit; docs/integrity.md)."""
 
 
 class Images(NamedTuple):
@@ -90,18 +83,16 @@ def kept_of(config: Config, images: Images) -> Kept:
     """What the monitor says over these images, and what would help most."""
     warm_up()
     rig = rig_of(config)
-    found = kept(rig, config.reference, frames_of(config, images))
-    return with_help(found, rig, config.reference, lambda: frames_of(config, images))
 
+    def run(known: Rig) -> Kept:
+        return kept(known, config.reference, frames_of(config, images))
 
-def first_image(config: Config, images: Images) -> Frame | None:
-    """The first of them that can be read."""
-    return next((frame for frame in frames_of(config, images) if frame.image is not None), None)
+    return with_help(run(rig), rig, run)
 
 
 def picture_of(config: Config, images: Images, found: Kept, ending: str) -> bytes | None:
     """The first image with what costs most drawn in it; ``ending``: .png, .jpg or .jpeg.  None without an image."""
-    frame = first_image(config, images)
+    frame = next((frame for frame in frames_of(config, images) if frame.image is not None), None)
     if frame is None or frame.image is None:
         return None
     rig, cam_T_grip = rig_of(config), config.cam_T_grip
@@ -109,50 +100,3 @@ def picture_of(config: Config, images: Images, found: Kept, ending: str) -> byte
     shown = TeachingImage(frame.image, frame.jaw_opening_m or config.jaw_opening_m or 0.0, frame.name)
     drawn = draw_doubted(rig.camera, rig.gripper, cam_T_grip, shown, doubted, config.view().edges_visible, found.why())
     return bytes(cv2.imencode(ending, drawn)[1].tobytes())
-
-
-def over_images(found: Kept, what: str) -> tuple[Level, str]:
-    """Level and text of the finding where there are images."""
-    text = f"over {what}: {found.text()}, alert limit {_both(found.alert_limit_m, found.alert_limit_rad)}"
-    if not found.images:
-        return "WARN", f"over {what}: none can be read"
-    if found.excess <= 1.0:
-        return "OK", text
-    needed = found.needed()
-    parts = [text, found.why(), f"for nine of ten frames to be valid it takes {needed}" if needed else "", found.help()]
-    return "WARN", "; ".join(filter(None, parts))
-
-
-def by_forecast(report: Forecast) -> tuple[Level, str] | None:
-    """The same where there is no image; None where nothing is in view, which the line about the view says."""
-    found = report.protection
-    if found is None:
-        return None
-    limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
-    share = max(found.position_m / limit_m, found.rotation_rad / limit_rad)
-    good = _both(found.position_m, found.rotation_rad)
-    subject = "the motion since the reference is " if report.valid_by == "reference" else ""
-    limit = f"the alert limit of {_both(limit_m, limit_rad)}"
-    forecast = "forecast without images (--images gives what frames keep)"
-    if share > 1.0:
-        text = f"no transform can be valid: {subject}good to {good}, beyond {limit}; valid needs {report.needed}"
-        return "WARN", f"{forecast}: {text}"
-    close = USUAL_SPREAD * share > 1.0
-    level: Level = "WARN" if close else "OK"
-    if close:
-        text = f"{subject}good to {good}, close to {limit}"
-    else:
-        text = f"{subject or 'a transform is '}good to {good}, within {limit}"
-    bevelled = report.protection_if_bevelled
-    if bevelled is not None and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
-        level = "WARN"
-        text += ", if all edges are as sharp as the gripper file says; to "
-        text += f"{_both(bevelled.position_m, bevelled.rotation_rad)} with bevels of {in_mm(UNTOLD_BEVEL_M)} mm: "
-        text += "teach them (gripmon teach), or state them (bevel_m)"
-    if close:
-        text += "; one frame in twenty is twice as uncertain: some will be suspect"
-    return level, f"{forecast}: {text}"
-
-
-def _both(position_m: float, rotation_rad: float) -> str:
-    return f"{in_mm(position_m)} mm and {in_degrees(rotation_rad)}°"

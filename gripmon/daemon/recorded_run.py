@@ -45,7 +45,7 @@ class RecordedRun:
         if begin is None:
             raise InputError(f"{self.name}: holds no configuration; the one to replay with", "config")
         self.notes: list[str] = []
-        self._differences, self._unbounded = Differences(), 0
+        self._differences = Differences()
         self.config, self.state = self._begin(begin)
         self._note_what_is_missing()
 
@@ -55,17 +55,13 @@ class RecordedRun:
         assert then is not None, "every replayed frame has a record"
         if then.since_reference is None:  # as versions without it recorded
             record = msgspec.structs.replace(record, since_reference=None)
-        unbounded = then.protection is None and record.protection is not None
-        self._unbounded += unbounded
-        self._differences.add(then, as_recorded_before_bounds(record) if unbounded else record)
+        self._differences.add(then, record)
 
     def summary(self) -> str:
         """How the replay differs from the recording."""
         lost, damaged = self.source.passed_over, self.source.images_damaged
         unread = f"; {lost} more could no longer be read" if lost else ""
         unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
-        if self._unbounded:
-            unread += f"; {self._unbounded} frames were recorded by a version without protection levels"
         recorded = self.recorded_config
         from_jpeg = recorded is not None and recorded.settings.recording.image_format == "jpeg"
         return f"{self._differences.text(from_jpeg)}{unread}"
@@ -146,12 +142,6 @@ class RecordedRun:
                 f"{source.stand_ins} refused frames have no image in the recording; they are refused again as "
                 "their records say"
             )
-
-
-def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
-    """The record as written by versions without bounds, which gave a reason only where nothing was measured."""
-    reason = None if record.measured else record.reason
-    return msgspec.structs.replace(record, protection=None, since_reference=None, absolute=None, reason=reason)
 
 
 def _limits(config: Config | None) -> Limits | None:

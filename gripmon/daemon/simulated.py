@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon import __version__
 from gripmon.analyse.comparison import Comparison, compare
 from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
-from gripmon.daemon.config.yaml_file import lines_of
+from gripmon.daemon.config.settings import JawSettings
+from gripmon.daemon.config.writing import reference_section, text_of
 from gripmon.daemon.watch import is_refused
-from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
+from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
 from gripmon.model.coverage import too_few
 from gripmon.model.errors import InputError, input_errors
@@ -29,7 +29,6 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
 from gripmon.model.targets import name_of
-from gripmon.model.yaml_text import yaml_value
 from gripmon.record.viewer import free_port
 from gripmon.simulate import (
     CALIBRATION_KINDS,
@@ -155,25 +154,12 @@ def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
 
 def _config_text(config: Config, scenario: Scenario, seed: int) -> str:
     """A commented configuration for the sequence, like the hand-written ones."""
-    reference = config.reference.cam_T_grip
-    jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
-    return f"""\
-# Written by: gripmon simulate {scenario.name} --seed {seed} (gripmon {__version__})
-robot: simulated  # name of the robot in the Zenoh keys
-camera_name: wrist  # name of the camera in the Zenoh keys
-camera:
-{lines_of(config.settings.camera, 2)}
-gripper: gripper.yaml  # path of the gripper file, relative to this file
-reference:
-  cam_T_grip:  # what a perfect calibration gave at the beginning: maps gripper coordinates to camera coordinates
-    translation_m: {yaml_value(reference.translation_m)}  # x, y, z (m)
-    rotation_xyzw: {yaml_value(reference.rotation_xyzw)}  # unit quaternion x, y, z, w
-jaw:
-  source: {jaw}  # the opening comes with each frame (timestamps.csv), or is the nominal one if fixed
-source:
-  kind: folder  # images in a folder
-  path: .  # the folder, relative to this file
-"""
+    reported = config.gripper.has_jaw and scenario.jaw.reported
+    return text_of(
+        f"gripmon simulate {scenario.name} --seed {seed}", robot="simulated", camera_name="wrist",
+        camera=config.settings.camera, gripper="gripper.yaml", reference=reference_section(config.reference.cam_T_grip),
+        source=FolderSettings(path="."), jaw=JawSettings(source="frames" if reported else "fixed"),
+    )  # fmt: skip
 
 
 class Latency(msgspec.Struct, frozen=True):

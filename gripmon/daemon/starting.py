@@ -20,7 +20,7 @@ from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.network import open_network, with_source
+from gripmon.daemon.network import Network
 from gripmon.daemon.running import run
 from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Source
@@ -95,7 +95,7 @@ def run_monitor(
     is called when the publisher is open, before the camera is.  ``keep_state``: the state that survives a restart is
     read from the configuration's state file, unless ``fresh_state``, and written there; and a warning is logged if the
     view can't meet the alert limits.  ``view``: show it live; ``take_over``: see
-    :func:`gripmon.daemon.network.open_network`.
+    :class:`gripmon.daemon.network.Network`.
 
     Raises :class:`InputError` for anything that can't be opened as configured or written to ``out``.
     """
@@ -117,7 +117,7 @@ def run_monitor(
         for refused in (monitor.strips_refused, monitor.since_refused):
             if refused is not None:
                 _log.warning("%s", refused)
-        network = open_network(config, take_over=take_over)
+        network = Network(config, take_over=take_over)
         opened.callback(network.close)
         on_network()
         compiled = warm_up()  # before the first frame
@@ -135,7 +135,7 @@ def run_monitor(
         if live is not None:
             live.open(viewed)
         opened.pop_all()  # from here on the daemon closes them
-        reports, policy = with_source(network.reports, source), settings.monitor.policy
+        network.report_on(source)
         return run(
             monitor,
             source=source,
@@ -148,9 +148,7 @@ def run_monitor(
             jaw=network.jaw,
             keeper=keeper,
             commands=network.commands,
-            reports=dataclasses.replace(
-                reports, alert_limit_m=policy.alert_limit_m, alert_limit_rad=policy.alert_limit_rad
-            ),
+            reports=network.reports,
             notices=_notices(kept),
             duration_s=duration_s,
             stop=stop,

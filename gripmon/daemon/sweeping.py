@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from gripmon.daemon.config import Config
 from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.forecast import rig_once_taught
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.errors import InputError
-from gripmon.model.geometry import to_record
-from gripmon.model.records import Array
-from gripmon.teach.mounts import (
-    Grid,
-    MeasurableMount,
-    Mount,
-    Trial,
-    field_of_view_rad,
-    towards,
-    tried,
-    try_mount,
-    with_focal,
-)
+from gripmon.model.progress import Progress, quiet
+from gripmon.teach.mounts import Mount, Trial, towards, try_mount, with_focal
 
 _MOST_MOUNTS, _MOST_VALUES = 20000, 100
 _BOUNDS = {
@@ -35,67 +25,92 @@ _BOUNDS = {
 _DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), (0.0, 75.0, 6)  # first, last, count: multiples of the present distance, degrees
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """The evaluated mounts of a grid, and the present one; ``at_px``: position of the TCP in all images."""
+class Sweep(msgspec.Struct, frozen=True):
+    """The evaluated mounts, the best first, and the present one, in metres, radians and px; ``tcp_at_px``: position of
+    the TCP in the present camera's image, in others correspondingly.
+    """
 
-    config: Config
-    grid: Grid
-    at_px: tuple[float, float]
+    config: str
+    tcp_at_px: tuple[float, float]
+    jaw_opening_m: float | None
+    warn_m: float
+    limit_m: float
+    alert_limit_m: float
+    alert_limit_rad: float
     present: Trial
-    trials: tuple[Trial, ...]
-
-    @property
-    def ranked(self) -> list[Trial]:
-        """The best first."""
-        return sorted(self.trials, key=lambda trial: trial.rank)
+    mounts: tuple[Trial, ...]
 
 
-def make_grid(
+def sweep(
     config: Config,
     ranges: Mapping[str, Sequence[float]],
     lenses: Sequence[Path] = (),
     at_px: tuple[float, float] | None = None,
-) -> tuple[Grid, tuple[float, float]]:
-    """All combinations of ``ranges``: ``distance`` (m), ``tilt``, ``side``, ``roll`` (degrees), see :class:`Mount`, and
-    ``focal`` (px) or ``fov`` (degrees over the image's width), or instead of these ``lenses``, files of calibrated
-    cameras.  Missing ranges keep the present value, except distance and tilt, which have default ranges.  ``at_px``:
-    position of the TCP in the present camera's image (None: as now), which is also returned.
+    travel_m: tuple[float, float] | None = None,
+    progress: Progress = quiet,
+) -> Sweep:
+    """Evaluate all combinations of ``ranges``: ``distance`` (m), ``tilt``, ``side``, ``roll`` (degrees), see
+    :class:`Mount`, and ``focal`` (px) or ``fov`` (degrees over the image's width), or instead of these ``lenses``,
+    files of calibrated cameras.  Missing ranges keep the present value, except distance and tilt, which have defaults.
+    ``at_px``: position of the TCP in the present camera's image (None: as now); ``travel_m``: the openings that count
+    (None: all).
 
     Raises :class:`InputError` for other ranges, values out of bounds, impossible lenses, a position outside the image,
-    and too many mounts.
+    openings outside the jaw's travel, and too many mounts.
     """
     for name, values in ranges.items():
         if name not in _BOUNDS:
             raise InputError(f"{name}: isn't an axis of a sweep; {', '.join(_BOUNDS)}", "ranges")
         if wrong := _wrong_with(name, values):
             raise InputError(f"{wrong}; {_in_words(name)}", name)
-    present, rig = Mount.of(config.cam_T_grip), rig_once_taught(config)
-    distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
-    turns = {"tilt": ranges.get("tilt") or _spaced(*_TILTS_DEG)}
-    turns |= {name: ranges[name] for name in ("side", "roll") if name in ranges}
-    rad = {name: tuple(math.radians(value) for value in values) for name, values in turns.items()}
+    _check_travel(config, travel_m)
+    present, rig, opening_m = Mount.of(config.cam_T_grip), rig_once_taught(config), config.jaw_opening_m
     cameras = [_calibrated(path) for path in lenses] or _cameras(config.camera, ranges)
     place = _place(config, at_px)
     try:
-        directions = tuple(towards(camera, _same_place(place, config.camera, camera)) for camera in cameras)
+        directions = [towards(camera, _same_place(place, config.camera, camera)) for camera in cameras]
     except ValueError as error:
         raise InputError(str(error), "at_px") from None
-    grid = Grid(
-        tuple(distances_m),
-        rad["tilt"],
-        rad.get("side", (present.side_rad,)),
-        rad.get("roll", (present.roll_rad,)),
-        tuple(rig._replace(camera=camera) for camera in cameras),
-        directions,
+    rigs = [(rig._replace(camera=camera), direction) for camera, direction in zip(cameras, directions, strict=True)]
+    distances_m = ranges.get("distance") or [present.distance_m * factor for factor in _spaced(*_DISTANCES)]
+    tilts_rad = map(math.radians, ranges.get("tilt") or _spaced(*_TILTS_DEG))
+    sides_rad = [math.radians(v) for v in ranges["side"]] if "side" in ranges else [present.side_rad]
+    rolls_rad = [math.radians(v) for v in ranges["roll"]] if "roll" in ranges else [present.roll_rad]
+    grid = [Mount(*axes) for axes in itertools.product(distances_m, tilts_rad, sides_rad, rolls_rad)]
+    if (count := len(grid) * len(rigs)) > _MOST_MOUNTS:
+        raise InputError(f"{count} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", "sweep")
+    trials = []
+    with progress(count, "mount") as step:
+        for (other, direction), mount in itertools.product(rigs, grid):
+            trials.append(try_mount(other, mount, mount.pose(direction), opening_m, travel_m))
+            step()
+    policy = config.settings.monitor.policy
+    return Sweep(
+        config=str(config.path),
+        tcp_at_px=place,
+        jaw_opening_m=opening_m,
+        warn_m=policy.warn_m,
+        limit_m=policy.limit_m,
+        alert_limit_m=policy.alert_limit_m,
+        alert_limit_rad=policy.alert_limit_rad,
+        present=try_mount(rig, present, config.cam_T_grip, opening_m, travel_m),
+        mounts=tuple(sorted(trials, key=lambda trial: trial.rank)),
     )
-    if len(grid) > _MOST_MOUNTS:
-        raise InputError(f"{len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", "sweep")
-    return grid, place
+
+
+def _check_travel(config: Config, travel_m: tuple[float, float] | None) -> None:
+    gripper = config.gripper
+    if travel_m is None:
+        return
+    if not gripper.jaw_max_m > gripper.jaw_min_m:
+        raise InputError("the gripper's jaw doesn't move; leave it out", "jaw")
+    if not gripper.jaw_min_m <= travel_m[0] < travel_m[1] <= gripper.jaw_max_m:
+        right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
+        raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g}: is not in the jaw's travel; {right}", "jaw")
 
 
 def values_in(name: str, text: str) -> tuple[float, ...]:
-    """The values, ascending, of a range for :func:`make_grid` as a person types it: FIRST:LAST:COUNT, or single ones
+    """The values, ascending, of a range for :func:`sweep` as a person types it: FIRST:LAST:COUNT, or single ones
     with commas.  Raises :class:`InputError` for another text, and values out of bounds.
     """
     right = f"FIRST:LAST:COUNT or values with commas, {_in_words(name)}"
@@ -165,96 +180,3 @@ def _place(config: Config, at_px: tuple[float, float] | None) -> tuple[float, fl
         right = f"two numbers inside {camera.width_px} x {camera.height_px} px"
         raise InputError(f"{where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}", "at_px")
     return u, v
-
-
-def sweep(
-    config: Config,
-    grid: Grid,
-    at_px: tuple[float, float],
-    travel_m: tuple[float, float] | None = None,
-    step: Callable[[], None] = lambda: None,
-) -> Sweep:
-    """Evaluate every mount of the grid at the openings ``travel_m`` (None: all); ``step`` is called after each.  Raises
-    :class:`InputError` for openings outside the jaw's travel.
-    """
-    gripper = config.gripper
-    if travel_m is not None:
-        if not gripper.jaw_max_m > gripper.jaw_min_m:
-            raise InputError("the gripper's jaw doesn't move; leave it out", "jaw")
-        if not gripper.jaw_min_m <= travel_m[0] < travel_m[1] <= gripper.jaw_max_m:
-            right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
-            raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g}: is not in the jaw's travel; {right}", "jaw")
-    opening_m, trials = config.jaw_opening_m, []
-    mount, cam_T_grip = Mount.of(config.cam_T_grip), config.cam_T_grip
-    present = try_mount(rig_once_taught(config), mount, -1, cam_T_grip, opening_m, travel_m)
-    for trial in tried(grid, opening_m, travel_m):
-        trials.append(trial)
-        step()
-    return Sweep(config, grid, at_px, present, tuple(trials))
-
-
-def as_plain(swept: Sweep) -> dict[str, Any]:
-    """As plain values for JSON: metres, radians, px."""
-    config = swept.config
-    return {
-        "config": str(config.path),
-        "tcp_at_px": list(swept.at_px),
-        "jaw_opening_m": config.jaw_opening_m,
-        "warn_m": config.settings.monitor.policy.warn_m,
-        "limit_m": config.settings.monitor.policy.limit_m,
-        "alert_limit_m": config.settings.monitor.policy.alert_limit_m,
-        "alert_limit_rad": config.settings.monitor.policy.alert_limit_rad,
-        "present": _trial_values(config.camera, swept.present),
-        "mounts": [_trial_values(swept.grid.rigs[trial.lens].camera, trial) for trial in swept.ranked],
-    }
-
-
-def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
-    transform, found = to_record(trial.cam_T_grip), trial.measurable
-    angle = field_of_view_rad(camera)
-    return {
-        **trial.mount._asdict(),
-        "image_px": [camera.width_px, camera.height_px],
-        "focal_px": camera.fx_px,
-        "field_of_view_rad": None if math.isnan(angle) else angle,
-        "cam_T_grip": {
-            "translation_m": list(transform.translation_m),
-            "rotation_xyzw": list(transform.rotation_xyzw),
-        },
-        "works": trial.works,
-        "reasons": [fault.text for fault in trial.faults],
-        "corners": trial.sight.corners,
-        "edges": trial.sight.edges,
-        "jaw": {
-            "opening_m": trial.openings_m.tolist(),
-            "corners": trial.corners.tolist(),
-            "edges": trial.edges.tolist(),
-            "share": trial.share,
-        },
-        **(dict.fromkeys(_OF_MEASURABLE) if found is None else _measurable_values(found)),
-    }
-
-
-_OF_MEASURABLE = (
-    "sigma", "weakest", "worst_sigma_m", "worst_at_m", "protection", "smallest", "delay_frames", "margin_px", "shift_m"
-)  # fmt: skip
-
-
-def _measurable_values(found: MeasurableMount) -> dict[str, Any]:
-    bound = found.promise.protection
-    return {
-        "sigma": _pose_values(found.frame.sigma),
-        "weakest": _pose_values(found.frame.weakest),
-        "worst_sigma_m": found.worst_sigma_m,
-        "worst_at_m": found.worst_at_m,
-        "protection": {"position_m": bound.position_m, "rotation_rad": bound.rotation_rad, "risk": bound.risk},
-        "smallest": _pose_values(found.smallest),
-        "delay_frames": found.delay_frames,
-        "margin_px": found.margin_px,
-        # JSON has no infinity.
-        "shift_m": None if math.isinf(found.shift_m) else found.shift_m,
-    }
-
-
-def _pose_values(vector: Array) -> dict[str, list[float]]:
-    return {"tcp_m": vector[:3].tolist(), "rotation_rad": vector[3:].tolist()}

@@ -121,3 +121,8 @@ def yaml_value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     return f"[{', '.join(yaml_value(item) for item in value)}]"
+
+
+def plain_value(value: Any) -> str:
+    """The same, a text without quotes where YAML needs none."""
+    return in_one_line(value) if type(value) is str else yaml_value(value)

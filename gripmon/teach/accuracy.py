@@ -1,27 +1,27 @@
-"""Accuracy forecast: how certain a frame's transform will be, what the view can't separate, which alert limits hold.
+"""Accuracy forecast: how certain a frame's transform will be, what the view can't separate, which bounds hold.
 
 The monitor's own measurement and update run on edge points where the model predicts them, each with the same assumed
-standard deviation.  The result is the covariance that follows from the geometry, without any image.
+standard deviation.  The result follows from the geometry, without any image; it is what ``gripmon check``, its sweep
+and the teaching page show and write as it is.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
+import msgspec
 import numpy as np
-from msgspec import structs
-from numpy.typing import NDArray
+from msgspec import Meta, structs
 
-from gripmon.judge.policy import PolicySettings
-from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, invert
+from gripmon.judge.drift import CORRELATION_FRAMES, foresee
+from gripmon.judge.recalibrate import coplanar, refusal
+from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image, Protection, ReferenceRecord, ValidBy
-from gripmon.model.units import in_degrees, in_mm
-from gripmon.monitor import Bounds, MonitorSettings, Tracker, foresee_bounds
-from gripmon.teach.visibility import Rig, samples_behind, see
-from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.model.records import Array, Image, Protection, ValidBy
+from gripmon.monitor import CORNER_COUNTS, Tracker, foresee_bounds
+from gripmon.teach.visibility import Rig, samples_behind
+from gripmon.track.edges import FingertipMeter, Measurement, Patience
 from gripmon.track.edges.kernel import FEWEST_EDGES
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction
 from gripmon.track.edges.profiles import Candidates, Edgels, weigh
@@ -36,86 +36,126 @@ CLUTTER_PX = 0.1
 of the usual frame in front of clutter; one frame in twenty has up to four times as much (tools/bench integrity).
 """
 
+_STEPS_M = (5e-5, 1e-4, 5e-4)
+"""Of the TCP, for which the drift test's delay is given."""
 
-@dataclass(frozen=True, slots=True)
-class UnknownOpening:
-    """The effect of an unknown jaw opening, the seventh unknown of the fit.
+_DIRECTIONS = (
+    "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
+)  # fmt: skip
 
-    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when the robot doesn't report it.  ``pose_per_m`` (6,):
-    error of the pose per metre of error of an opening that is taken as exact.  ``correlation``, 0 to 1, of an unknown
-    opening with the pose's least certain direction: near 1 the image can't separate them.
+Vector = tuple[float, float, float]
+
+
+class PoseValues(msgspec.Struct, frozen=True):
+    """Six numbers about a pose: the TCP's position in camera axes (m) and the rotation about them (rad)."""
+
+    tcp_m: Vector
+    rotation_rad: Vector
+
+    @classmethod
+    def of(cls, values: Array) -> PoseValues:
+        """From an array (6,)."""
+        return msgspec.convert({"tcp_m": values[:3].tolist(), "rotation_rad": values[3:].tolist()}, cls)
+
+    @property
+    def array(self) -> Array:
+        """As an array (6,)."""
+        return np.array([*self.tcp_m, *self.rotation_rad])
+
+
+class UnknownJaw(PoseValues, frozen=True):
+    """Standard deviations if the jaw opening were unknown, the seventh unknown of the fit (m, rad)."""
+
+    jaw_m: float
+
+
+class JawAccuracy(msgspec.Struct, frozen=True):
+    """The uncertainty of the reported opening, and how well the image alone determines it.
+
+    ``pose_per_jaw_m``: error of the pose per metre of error of an opening that is taken as exact, and what that is most
+    ``like``.  ``correlation``, 0 to 1, of an unknown opening with the pose's least certain direction: near 1 the image
+    can't separate them.
     """
 
-    sigma: Array
-    sigma_m: float
-    pose_per_m: Array
+    reported_sigma_m: float
+    unknown: UnknownJaw
+    pose_per_jaw_m: PoseValues
+    like: str
     correlation: float
-
-    @property
-    def growth(self) -> float:
-        """Factor by which the least certain direction is less certain than with an exactly known opening."""
-        return float(1.0 / np.sqrt(max(1.0 - self.correlation**2, 1e-12)))
+    growth: Annotated[float, Meta(description="how many times less certain the pose is without the opening")]
 
 
-@dataclass(frozen=True, slots=True)
-class AccuracyForecast:
-    """Expected accuracy of a frame that measures all visible edges; vectors are (position, rotation), m and rad.
+class DriftForecast(msgspec.Struct, frozen=True):
+    """The smallest step that the drift test detects, and its delay in frames for other steps."""
 
-    ``covariance`` (6, 6) as it would be published.  ``edges``: number that can be sampled; with fewer than
-    ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
-    distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``bounds``: both
-    protection levels in front of clutter, and ``protection`` the one that makes a transform valid.  ``jaw``: the effect
-    of an unknown opening; None for a gripper without jaw, or
-    where not asked for.
+    false_alarms_per_day: float
+    frames_per_s: float
+    correlation_frames: float
+    smallest: PoseValues
+    delay_frames: Annotated[
+        dict[str, tuple[int | None, int | None, int | None]],
+        Meta(description="by the size of the TCP's step (m): along x, y, z; null: never"),
+    ]
+
+
+class RecalibrationForecast(msgspec.Struct, frozen=True):
+    """Whether the visible corners determine a pose by themselves, and the uncertainty of one frame (m): an average over
+    frames with lasting errors is hardly more certain.
     """
 
-    covariance: Array
+    corners: int
+    coplanar: bool
+    possible: bool
+    reason: str | None
+    sigma_m: float | None
+    sure_sigma_m: float
+    mode: str
+
+
+class Accuracy(msgspec.Struct, frozen=True):
+    """What is expected of a frame that measures all visible edges; None if too few of them are visible.
+
+    ``covariance`` (6 x 6, row by row) as it would be published; ``since_reference`` and ``absolute``: both protection
+    levels in front of clutter; ``jaw``: the effect of an unknown opening, also None without a jaw or where not asked
+    for.
+    """
+
+    measurement: str
     edges: int
-    corners: NDArray[np.bool_]
-    lever_m: float
-    bounds: Bounds
-    protection: Protection
-    jaw: UnknownOpening | None
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (6,)."""
-        return np.asarray(np.sqrt(self.covariance.diagonal()))
-
-    @property
-    def weakest(self) -> Array:
-        """One standard deviation (6,) along the least certain direction, a radian counting as ``lever_m``."""
-        return weakest_direction(self.covariance, self.lever_m)
-
-    @property
-    def tcp_sigma_m(self) -> float:
-        """Standard deviation of the TCP along its least certain direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+    edges_needed: int
+    corners: Annotated[int, Meta(description="those in view with two edges that are long enough and not parallel")]
+    edge_point_sigma_px: float
+    recalibration: RecalibrationForecast
+    expected: Annotated[PoseValues | None, Meta(description="standard deviations")] = None
+    weakest: (
+        Annotated[PoseValues, Meta(description="the least certain direction, one standard deviation long")] | None
+    ) = None
+    jaw: JawAccuracy | None = None
+    drift: DriftForecast | None = None
+    covariance: tuple[float, ...] | None = None
+    since_reference: Protection | None = None
+    absolute: Protection | None = None
 
     @property
     def enough(self) -> bool:
         """Whether anything can be measured at all."""
-        return self.edges >= FEWEST_EDGES
+        return self.edges >= self.edges_needed
+
+    @property
+    def tcp_sigma_m(self) -> float | None:
+        """Standard deviation of the TCP along its least certain direction."""
+        if self.covariance is None:
+            return None
+        return float(np.sqrt(np.linalg.eigvalsh(np.reshape(self.covariance, (6, 6))[:3, :3])[-1]))
+
+    def by(self, valid_by: ValidBy) -> Protection | None:
+        """The protection level that a setting names."""
+        return self.since_reference if valid_by is ValidBy.REFERENCE else self.absolute
 
 
-def forecast_accuracy(
-    camera: Camera,
-    gripper: Gripper,
-    settings: MonitorSettings,
-    reference: ReferenceRecord,
-    jaw_opening_m: float | None,
-    taught: TaughtEdges | None = None,
-) -> AccuracyForecast:
-    """Expected accuracy of a frame at the reference's pose and an opening (nominal if None)."""
-    rig = Rig(camera, gripper, settings, taught)
-    return forecast_frame(rig, from_record(reference.cam_T_grip), jaw_opening_m, with_jaw=gripper.has_jaw)
-
-
-def forecast_frame(
-    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, with_jaw: bool = False
-) -> AccuracyForecast:
-    """Expected accuracy of a frame at a pose and a reported opening (nominal if None); ``with_jaw``: with an unknown
-    opening, too.
+def forecast_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, with_jaw: bool = False) -> Accuracy:
+    """What is expected of a frame at a pose (4, 4) and a reported opening (nominal if None); ``with_jaw``: with an
+    unknown opening, too.
     """
     gripper, settings = rig.gripper, rig.settings
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
@@ -123,22 +163,84 @@ def forecast_frame(
     tracker = Tracker(rig.camera, gripper, settings, rig.taught)
     given = meter.forecast(cam_T_grip, opening_m, jaw_reported=True)
     covariance = tracker.update(given)[1]
+    edges = np.bincount(given.prediction.layout.edge[given.candidates.sample], minlength=1) >= FEWEST_SAMPLES
+    enough = int(np.count_nonzero(edges)) >= FEWEST_EDGES
+    sigma = np.sqrt(covariance.diagonal())
+    found = Accuracy(
+        measurement=settings.measurement,
+        edges=int(np.count_nonzero(edges)),
+        edges_needed=FEWEST_EDGES,
+        corners=int(np.count_nonzero(given.corners.usable)),
+        edge_point_sigma_px=EDGE_POINT_SIGMA_PX,
+        recalibration=_recalibration(rig, given, opening_m, float(max(sigma[:3])) if enough else None),
+    )
+    if not enough:
+        return found
     levers_m = gripper.points_grip_m(opening_m if gripper.has_jaw else None)[gripper.landmarks]
-    lever_m = float(np.sqrt((levers_m**2).sum(axis=1).mean()))
-    jaw = None
-    if with_jaw:
+    lever_m, jaw = float(np.sqrt((levers_m**2).sum(axis=1).mean())), None
+    if with_jaw and gripper.has_jaw:
         free = meter.forecast(cam_T_grip, opening_m, jaw_reported=False)
-        jaw = _unknown_opening(tracker.update(free)[1], free.covariance, lever_m)
-    seen = np.bincount(given.prediction.layout.edge[given.candidates.sample], minlength=1) >= FEWEST_SAMPLES
+        jaw = _jaw_accuracy(tracker.update(free)[1], free.covariance, lever_m, settings.jaw_sigma_m)
     both = foresee_bounds(tracker, gripper, settings, given)
-    protection, edges = both.by(settings.policy.valid_by), int(np.count_nonzero(seen))
-    return AccuracyForecast(covariance, edges, given.corners.usable, lever_m, both, protection, jaw)
+    return structs.replace(
+        found,
+        expected=PoseValues.of(sigma),
+        weakest=PoseValues.of(weakest_direction(covariance, lever_m)),
+        jaw=jaw,
+        drift=_drift(rig, covariance),
+        covariance=tuple(covariance.ravel().tolist()),
+        since_reference=both.since_reference,
+        absolute=both.absolute,
+    )
 
 
-def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tuple[float, AccuracyForecast | None]]:
-    """The expected accuracy at ``count`` openings (m) over the jaw's travel; None where too little is visible."""
-    openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count).tolist()
-    return [(m, forecast_frame(rig, cam_T_grip, m) if see(rig, cam_T_grip, m).enough else None) for m in openings_m]
+def _drift(rig: Rig, covariance: Array) -> DriftForecast:
+    settings = rig.settings.drift
+    detectable = foresee(covariance, settings)
+    steps_m = sorted({*_STEPS_M, rig.settings.policy.warn_m})
+    return DriftForecast(
+        settings.false_alarms_per_day,
+        settings.frames_per_s,
+        CORRELATION_FRAMES,
+        PoseValues.of(detectable.smallest),
+        {f"{m:g}": (*(detectable.delay_frames(m, axis) for axis in range(3)),) for m in steps_m},  # type: ignore[misc]
+    )
+
+
+def _recalibration(rig: Rig, given: Measurement, opening_m: float, sigma_m: float | None) -> RecalibrationForecast:
+    gripper, settings = rig.gripper, rig.settings
+    taken = gripper.innermost_corners(given.corners.usable, CORNER_COUNTS[settings.recalibrate_corners])
+    points_grip_m = gripper.points_grip_m(opening_m if gripper.has_jaw else None)[gripper.corner_points][taken]
+    reason = refusal(points_grip_m)
+    return RecalibrationForecast(
+        corners=len(points_grip_m),
+        coplanar=bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
+        possible=reason is None,
+        reason=reason,
+        sigma_m=sigma_m,
+        sure_sigma_m=settings.recalibration.sure_sigma_m,
+        mode=settings.recalibration.mode,
+    )
+
+
+def _jaw_accuracy(pose_covariance: Array, covariance: Array, lever_m: float, reported_sigma_m: float) -> JawAccuracy:
+    """``covariance`` (7, 7) is that of the fit, ``pose_covariance`` (6, 6) as it would be published; a radian counts as
+    ``lever_m``.
+    """
+    weakest, scale = weakest_direction(covariance[:6, :6], lever_m), np.array([1.0] * 3 + [lever_m] * 3)
+    # Its length is one standard deviation; projecting on it twice cancels the scale.
+    with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
+    jaw_sigma_m = float(np.sqrt(covariance[6, 6]))
+    pose_per_jaw, correlation = covariance[:6, 6] / covariance[6, 6], abs(with_jaw) / jaw_sigma_m
+    unknown = PoseValues.of(np.sqrt(pose_covariance.diagonal()))
+    return JawAccuracy(
+        reported_sigma_m=reported_sigma_m,
+        unknown=UnknownJaw(unknown.tcp_m, unknown.rotation_rad, jaw_sigma_m),
+        pose_per_jaw_m=PoseValues.of(pose_per_jaw),
+        like=_DIRECTIONS[int(np.abs(pose_per_jaw * scale).argmax())],
+        correlation=correlation,
+        growth=float(1.0 / np.sqrt(max(1.0 - correlation**2, 1e-12))),
+    )
 
 
 def with_bevels(gripper: Gripper, least_m: float) -> Gripper:
@@ -184,19 +286,6 @@ def weakest_direction(covariance: Array, lever_m: float) -> Array:
     return np.asarray(weakest * (1.0 if weakest[np.abs(weakest * scale).argmax()] > 0.0 else -1.0))
 
 
-def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) -> UnknownOpening:
-    """``covariance`` (7, 7) is that of the fit, ``pose_covariance`` (6, 6) as it would be published."""
-    weakest = weakest_direction(covariance[:6, :6], lever_m)
-    scale = np.array([1.0] * 3 + [lever_m] * 3)
-    # Its length is one standard deviation; projecting on it twice cancels the scale.
-    with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
-    variance = float(covariance[6, 6])
-    sigma_m = float(np.sqrt(variance))
-    return UnknownOpening(
-        np.sqrt(pose_covariance.diagonal()), sigma_m, covariance[:6, 6] / variance, abs(with_jaw) / sigma_m
-    )
-
-
 class ForecastMeter(FingertipMeter):
     """Measures without an image: assumes an edge point, at its predicted position, on every search line that no other
     finger hides.
@@ -224,68 +313,3 @@ class ForecastMeter(FingertipMeter):
         scatters = assess(edgels, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
         return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
-
-
-@dataclass(frozen=True, slots=True)
-class Promise:
-    """``protection`` of a transform for which all visible edges are measured, and the alert limits to compare it with:
-    whether transforms of a view can be valid, before there is any image.  ``remedies``: if they can't, what would make
-    them valid, each by itself.
-    """
-
-    protection: Protection
-    alert_limit_m: float
-    alert_limit_rad: float
-    valid_by: ValidBy = ValidBy.ABSOLUTE
-    remedies: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
-        return cls(protection, policy.alert_limit_m, policy.alert_limit_rad, policy.valid_by)
-
-    @property
-    def reachable(self) -> bool:
-        """Whether a transform of this view can be valid."""
-        return self.excess <= 1.0
-
-    @property
-    def excess(self) -> float:
-        """The larger of both bounds over its limit: above 1, no transform can be valid."""
-        bound = self.protection
-        return max(bound.position_m / self.alert_limit_m, bound.rotation_rad / self.alert_limit_rad)
-
-    @property
-    def needed(self) -> str:
-        """Remedies, or the alert limits that this view can keep, where the present ones are too tight; else empty."""
-        bound, parts = self.protection, []
-        if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
-            return "more of the fingers in view: no limit would do"
-        if bound.position_m > self.alert_limit_m:
-            needed_m = rounded_up(bound.position_m)
-            parts.append(f"alert_limit_m of at least {needed_m:g} ({1e3 * needed_m:g} mm)")
-        if bound.rotation_rad > self.alert_limit_rad:
-            needed_rad = rounded_up(bound.rotation_rad)
-            parts.append(f"alert_limit_rad of at least {needed_rad:g} ({in_degrees(needed_rad)} degrees)")
-        return ", or ".join([*self.remedies, " and ".join(parts)])
-
-    @property
-    def subject(self) -> str:
-        """What the bound is of, in words."""
-        return "the motion since the reference" if self.valid_by is ValidBy.REFERENCE else "a transform"
-
-    def text(self) -> str:
-        """One line for a person."""
-        bound = self.protection
-        good = f"good to {in_mm(bound.position_m)} mm and {in_degrees(bound.rotation_rad)} degrees"
-        limits = f"{1e3 * self.alert_limit_m:g} mm, {in_degrees(self.alert_limit_rad)} degrees"
-        reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
-        promise = (
-            f"{self.subject} of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
-        )
-        return f"forecast: {promise}"
-
-
-def rounded_up(value: float) -> float:
-    """Round up to two significant digits."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return math.ceil(value / unit - 1e-9) * unit

@@ -93,7 +93,7 @@ class Teaching:
         untaught = Rig(config.camera, config.gripper, self.settings)
         taught = untaught._replace(taught=self.edges)
         before, after = (kept(rig, config.reference, frames) for rig in (untaught, taught))
-        return before, with_help(after, taught, config.reference, lambda: frames)
+        return before, with_help(after, taught, lambda rig: kept(rig, config.reference, frames))
 
     def text(self) -> str:
         """The taught model's file (YAML)."""
@@ -279,7 +279,6 @@ _HEADER = """\
 #   edges.*.crease      true: between two visible faces; false: an outline
 #   edges.*.brighter    the brighter side of a crease, where it may be relied on
 #   edges.*.rms_px      scatter of the edge points about the line (px); seen: share of its search lines that showed it
-#   edges.*.left, right grey level of the finger on that side over the median of all edges, its spread along the edge
 #   corners.*.uv_px     where taught edges meet in the first image (px), and its standard deviation
 # The measurement uses offsets, depths, their deviations, crease and brighter; the rest below edges and corners
 # describes what was seen.

@@ -1,7 +1,8 @@
-"""What frames keep: a monitor's own bounds over images that are there, and what makes them as large.
+"""What frames keep: a monitor's own bounds over images that are there, what makes them as large and what would help.
 
 A forecast knows neither the light nor what stands behind the fingers; on real grippers it promised a third of what the
-frames needed.  So wherever there are images, the monitor itself is run over them.
+frames needed.  So wherever there are images, the monitor itself is run over them; without any, the same is said of the
+bounds that are forecast of a frame.
 """
 
 from __future__ import annotations
@@ -9,16 +10,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import NOTHING_WRONG, Array, Frame, FrameRecord, ReferenceRecord, ValidBy, Verdict
+from gripmon.model.records import NOTHING_WRONG, Array, Frame, ReferenceRecord, ValidBy, Verdict
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.monitor import Monitor
-from gripmon.teach.accuracy import as_if_measured, rounded_up
+from gripmon.teach.accuracy import Accuracy, as_if_measured, forecast_frame
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import VAGUE_M, VAGUE_RAD
@@ -38,6 +38,9 @@ away.
 
 LEAST_HELP = 0.9
 """Ratio of bounds below which a remedy is worth saying."""
+
+USUAL_SPREAD = 2.0
+"""Ratio of the bound to the forecast one that one frame in twenty reaches (no unit; docs/integrity.md)."""
 
 
 class Sizes(msgspec.Struct, frozen=True):
@@ -68,6 +71,8 @@ class Kept(msgspec.Struct, frozen=True):
     ``hypothesis``: what it can't be excluded most often, that makes this bound as large, and in how many images;
     ``reason``: why most of those that weren't measured weren't.  ``helps``: what would help most, and the median that
     the bound has with it, None where that wasn't computed.
+
+    ``forecast``: of no image, but of a frame that measures all edges in view, before the usual clutter.
     """
 
     images: int
@@ -85,6 +90,7 @@ class Kept(msgspec.Struct, frozen=True):
     helps: str | None = None
     helped_m: float | None = None
     helped_rad: float | None = None
+    forecast: bool = False
 
     @property
     def counted(self) -> int:
@@ -106,7 +112,7 @@ class Kept(msgspec.Struct, frozen=True):
         sizes = self.sizes
         if sizes.most_m is None or sizes.most_rad is None or sizes.median_m is None or sizes.median_rad is None:
             return None
-        power = QUANTILE_ERROR / math.sqrt(self.counted)
+        power = QUANTILE_ERROR / math.sqrt(max(self.counted, 1))
         return (
             sizes.most_m * (sizes.most_m / sizes.median_m) ** power,
             sizes.most_rad * (sizes.most_rad / sizes.median_rad) ** power,
@@ -128,16 +134,38 @@ class Kept(msgspec.Struct, frozen=True):
             return math.inf
         return max(sizes.median_m / self.alert_limit_m, sizes.median_rad / self.alert_limit_rad)
 
+    @property
+    def reachable(self) -> bool:
+        """Whether nine of ten frames are within the alert limits."""
+        return self.excess <= 1.0
+
     def text(self) -> str:
         """One line for a person: what the bounds are."""
+        sizes, by_reference = self.sizes, self.valid_by is ValidBy.REFERENCE
+        known = sizes.median_m is not None and sizes.median_rad is not None
+        median = _said(sizes.median_m, sizes.median_rad) if known else "no bound is known"
+        if self.forecast:
+            subject = "the motion since the reference" if by_reference else "a transform"
+            return f"{subject} of this view is good to {median}" if known else median
         seen = f"{self.measured} of {self.counted} measured, {self.valid} valid"
-        sizes, of = self.sizes, "the motion since the reference" if self.valid_by is ValidBy.REFERENCE else "the TCP"
-        if sizes.median_m is None or sizes.median_rad is None:
-            return f"{seen}; {self.reason or 'no bound is known'}"
-        text = f"{seen}; bound on {of}, median {_said(sizes.median_m, sizes.median_rad)}"
+        if not known:
+            return f"{seen}; {self.reason or median}"
+        text = f"{seen}; bound on {'the motion since the reference' if by_reference else 'the TCP'}, median {median}"
         if sizes.most_m is None or sizes.most_rad is None:
             return f"{text}, {100.0 * SHARE:g} % of them: none"
         return f"{text}, {100.0 * SHARE:g} % within {_said(sizes.most_m, sizes.most_rad)}"
+
+    def promise(self) -> str:
+        """The same beside the alert limits, with what would be needed where they are too tight."""
+        text = f"{self.text()}, alert limit {_said(self.alert_limit_m, self.alert_limit_rad)}"
+        if self.reachable:
+            close = self.forecast and USUAL_SPREAD * self.excess > 1.0
+            some = "close to the alert limit: one frame in twenty is twice as uncertain, some will be suspect"
+            return f"{text}; {some}" if close else text
+        needed, why, takes = self.needed(), self.why(), "for nine of ten frames to be valid it takes"
+        if self.forecast:
+            why, takes = "", "no transform can be valid: valid needs"
+        return "; ".join(filter(None, [text, why, f"{takes} {needed}" if needed else "", self.help()]))
 
     def why(self) -> str:
         """What makes the bound as large, in words of the picture; empty where nothing was measured."""
@@ -153,7 +181,9 @@ class Kept(msgspec.Struct, frozen=True):
         empty where they are wide enough.
         """
         proposed = self.proposed
-        if proposed is None or self.excess <= 1.0:
+        if proposed is None and self.forecast:
+            return "more of the fingers in view: no limit would do"
+        if proposed is None or self.reachable:
             return ""
         parts, (m, rad) = [], (rounded_up(value) for value in proposed)
         if m > self.alert_limit_m:
@@ -170,15 +200,15 @@ class Kept(msgspec.Struct, frozen=True):
         return f"what helps most: {self.helps}{f' (median then {with_it})' if with_it else ''}"
 
 
-def _said(position_m: float, rotation_rad: float) -> str:
+def _said(position_m: float | None, rotation_rad: float | None) -> str:
+    assert position_m is not None and rotation_rad is not None
     return f"{in_mm(position_m)} mm and {in_degrees(rotation_rad)}°"
 
 
-class _Run(NamedTuple):
-    """Records of counted frames, and the number of all."""
-
-    images: int
-    records: list[FrameRecord]
+def rounded_up(value: float) -> float:
+    """Round up to two significant digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit
 
 
 def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
@@ -219,6 +249,28 @@ def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
     )
 
 
+def foreseen(accuracy: Accuracy, rig: Rig) -> Kept:
+    """What is forecast of a frame of a view, as if it had been kept."""
+    policy, bound = rig.settings.policy, accuracy.by(rig.settings.policy.valid_by)
+    since, absolute = (
+        Sizes.of(np.array([(each.position_m, each.rotation_rad)] if each is not None else []))
+        for each in (accuracy.since_reference, accuracy.absolute)
+    )
+    hypothesis = "" if bound is None else bound.hypothesis
+    limits = policy.alert_limit_m, policy.alert_limit_rad
+    return Kept(0, 0, 0, 0, policy.valid_by, since, absolute, hypothesis, 0, None, *limits, forecast=True)
+
+
+def promise_of(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, accuracy: Accuracy | None = None) -> Kept:
+    """The same of the view from a pose (4, 4), and what would help most where the alert limits are too tight."""
+
+    def run(known: Rig) -> Kept:
+        return foreseen(forecast_frame(known, cam_T_grip, jaw_opening_m), known)
+
+    found = run(rig) if accuracy is None else foreseen(accuracy, rig)
+    return found if found.reachable else with_help(found, rig, run)
+
+
 def as_frames(images: Iterable[TeachingImage]) -> list[Frame]:
     """Teaching images as frames, one after the other."""
     return [
@@ -227,12 +279,12 @@ def as_frames(images: Iterable[TeachingImage]) -> list[Frame]:
     ]
 
 
-def with_help(found: Kept, rig: Rig, reference: ReferenceRecord, again: Callable[[], Iterable[Frame]]) -> Kept:
-    """The same with the one thing that helps most: the monitor is run over the frames, which ``again`` gives, with each
-    thing known that a person can measure.  Where none of these helps, what the hypothesis asks for.
+def with_help(found: Kept, rig: Rig, again: Callable[[Rig], Kept]) -> Kept:
+    """The same with the one thing that helps most: ``again`` says what is kept with each thing known that a person can
+    measure, and if none of these suffices, with less to be promised.  Where none helps, what the hypothesis asks for.
     """
-    tried = {words: kept(known, reference, again()) for words, known in as_if_measured(rig).items()}
-    if found.valid_by is ValidBy.ABSOLUTE:
+    tried = {words: again(known) for words, known in as_if_measured(rig).items()}
+    if found.valid_by is ValidBy.ABSOLUTE and not any(each.reachable for each in tried.values()):
         tried["valid_by: reference, if only the motion since the reference counts"] = msgspec.structs.replace(
             found, valid_by=ValidBy.REFERENCE
         )

@@ -29,8 +29,8 @@ class EdgePoints:
     """Edge points of one edge in all images, against the reference's prediction.
 
     ``way`` (k,) from 0 to 1 along the sampled part, ``offset_px`` (k,), ``step`` (k,) grey-level step, ``profile`` (k,)
-    number of the search line, ``image`` (k,) of the image, ``candidate`` (k,) number among that image's edge points;
-    ``profiles`` (i,) number of search lines on this edge in each image.
+    number of the search line, ``image`` (k,) of the image; ``profiles`` (i,) number of search lines on it in each
+    image.
     """
 
     way: Array
@@ -38,7 +38,6 @@ class EdgePoints:
     step: Array
     profile: NDArray[np.intp]
     image: NDArray[np.intp]
-    candidate: NDArray[np.intp]
     profiles: NDArray[np.intp]
 
 
@@ -127,7 +126,6 @@ def of_image(points: EdgePoints, image: int) -> EdgePoints:
         points.step[own],
         points.profile[own],
         points.image[own],
-        points.candidate[own],
         profiles,
     )
 

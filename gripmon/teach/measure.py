@@ -13,15 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.records import Array, ReferenceRecord
+from gripmon.model.records import ReferenceRecord
 from gripmon.teach.estimate import (
     SHAPE_M,
     EdgeLines,
@@ -46,8 +45,7 @@ from gripmon.teach.views import (
 )
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import Measurement
-from gripmon.track.edges.prediction import STEP_PX
-from gripmon.track.edges.taught import Look, PoseOffset, TaughtCorner, TaughtEdge, TaughtEdges
+from gripmon.track.edges.taught import PoseOffset, TaughtCorner, TaughtEdge, TaughtEdges
 
 T = TypeVar("T")
 
@@ -166,9 +164,11 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
     # Repeat with the search lines centred on the real edges.
     views = [viewer.view(view.image, None, arrays, view.candidates.zoom) for view in views]
     lines, lost = _lines(viewer, views, search=False)
-    seen = {gripper.edge_ids[index]: one._asdict() for index, one in _appearances(viewer, views, lines).items()}
     edges = estimate_edges(viewer, lines, edges)
-    edges = {name: msgspec.structs.replace(edge, **seen.get(name, {})) for name, edge in edges.items()}
+    # Next to an outline the background decides, and it will differ from that of the teaching images.
+    for index in (index for index, edge in lines.items() if edge.line is not None and viewer.crease[index]):
+        name = gripper.edge_ids[index]
+        edges[name] = msgspec.structs.replace(edges[name], brighter=_brighter(lines[index]))
     arrays = viewer.arrays(edges)
     return Taught(
         edges,
@@ -282,97 +282,12 @@ def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: s
     return tuple(notes)
 
 
-NEAR_PX, FAR_PX = 1.5, 3.0
-"""Range in which a side's grey level is taken: beyond the edge's blur, before the next feature (px, times the zoom)."""
-
 AGREEING_SHARE = 0.95
 """Least part of the edge points of all images that must have the same side brighter."""
 
-Side = Literal["left", "right", "any"]
 
-
-class _Appearance(NamedTuple):
-    """``brighter`` side, and the appearance of those sides that are the finger's."""
-
-    brighter: Side
-    left: Look | None
-    right: Look | None
-
-
-class _Sides(NamedTuple):
-    """Grey levels (k,) left and right of an edge's points, their steps (k,) and images (k,)."""
-
-    left: Array
-    right: Array
-    step: Array
-    image: NDArray[np.intp]
-
-
-def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> dict[int, _Appearance]:
-    """The appearance of all edges that have lines.
-
-    Levels are relative to the median over all edges of an image, which cancels the exposure.
-    """
-    sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
-    gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
-    found = {}
-    for index, side in sides.items():
-        gain = np.array(gains)[side.image]
-        inside, crease = viewer.inside[index], viewer.crease[index]
-        left = _look(side.left / gain) if crease or inside < 0.0 else None
-        right = _look(side.right / gain) if crease or inside > 0.0 else None
-        # Next to an outline the background decides, and it will differ from that of the teaching images.
-        found[index] = _Appearance(_brighter(side.step) if crease else "any", left, right)
-    return found
-
-
-def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:
+def _brighter(edge: EdgeLines) -> Literal["left", "right", "any"]:
+    """The brighter side of an edge in all images; any where they don't agree."""
     assert edge.line is not None
-    points, inlier = edge.sampled.points, edge.line.inlier
-    parts = []
-    for number, view in enumerate(views):
-        candidate = points.candidate[inlier & (points.image == number)]
-        found, grey = view.candidates, view.profiles
-        sample, step = found.sample[candidate], found.step[candidate]
-        # On a coarser scale the samples are farther apart, and edges are wider.
-        middle = grey.shape[1] // 2 + found.offset_px[candidate] / (STEP_PX * found.zoom)
-        near, far = NEAR_PX / STEP_PX, FAR_PX / STEP_PX
-        levels = [_level(grey[sample], middle + side * near, middle + side * far) for side in (-1.0, 1.0)]
-        parts.append((*levels, step, np.full(len(sample), number)))
-    return _Sides(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-
-
-def _level(grey: NDArray[np.float32], start: Array, end: Array) -> Array:
-    """Mean (k,) of each row of ``grey`` (k, s) between two positions on it, in samples; NaN where they leave it."""
-    places = np.linspace(start, end, 4)
-    low = np.floor(places).astype(int)
-    outside = (low < 0) | (low + 1 >= grey.shape[1])
-    low = np.clip(low, 0, grey.shape[1] - 2)
-    rows = np.arange(len(grey))
-    values = grey[rows, low] + (places - low) * (grey[rows, low + 1] - grey[rows, low])
-    return np.asarray(np.where(outside, np.nan, values).mean(axis=0))
-
-
-def _usual_level(viewer: Viewer, sides: Mapping[int, _Sides], image: int) -> float:
-    """Median over all edges of the finger's level beside them, in one image."""
-    levels = []
-    for index, side in sides.items():
-        for sign, grey in ((-1.0, side.left), (1.0, side.right)):
-            own = grey[(side.image == image) & np.isfinite(grey)]
-            if len(own) and (viewer.crease[index] or viewer.inside[index] == sign):
-                levels.append(float(np.median(own)))
-    return max(float(np.median(levels)), 1e-9) if levels else 1.0
-
-
-def _look(relative: Array) -> Look | None:
-    relative = relative[np.isfinite(relative)]
-    if not len(relative):
-        return None
-    level = float(np.median(relative))
-    spread = 1.4826 * float(np.median(np.abs(relative - level)))
-    return Look(level=round(max(level, 0.0), 4), spread=round(spread, 4))
-
-
-def _brighter(step: Array) -> Side:
-    right = float(np.mean(step > 0.0))
+    right = float(np.mean(edge.sampled.points.step[edge.line.inlier] > 0.0))
     return "right" if right >= AGREEING_SHARE else "left" if right <= 1.0 - AGREEING_SHARE else "any"

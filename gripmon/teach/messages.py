@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.model.records import Image
+from gripmon.teach.accuracy import Accuracy
 
 Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
 Place = tuple[Pixel, Pixel]
@@ -72,11 +73,9 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     ``back``: where the page goes when the person is done.
     """
 
-    version: str
     width_px: int
     height_px: int
     corners: tuple[str, ...]
-    fingers: dict[str, str]
     places: dict[str, Place | None]
     pictures: tuple[PictureInfo, ...]
     live: str | None
@@ -108,32 +107,21 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Expected of one frame; vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
-    ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
-    drift test detects.  ``promise``: bounds on its error and the alert limits, as a text; ``reachable``: it keeps them.
-    ``delay_frames`` until the test detects a step of the TCP by 0.1 mm along x, y and z, None for never.
-    ``recalibration``: why the corners in view give no new pose, None if they do.
+    """Of one frame: its ``accuracy``, and as a text the ``promise``: bounds on its error beside the alert limits;
+    ``reachable``: it keeps them.
     """
 
-    edges: int
-    sigma: tuple[float, ...]
-    weakest: tuple[float, ...]
-    smallest: tuple[float, ...]
+    accuracy: Accuracy
     promise: str
     reachable: bool
-    delay_frames: tuple[int | None, ...]
-    recalibration: str | None
 
 
 class ReferenceReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``id`` with ``translation_m``, the angle between camera and gripper, and standard deviations (6,)."""
+    """``id`` with standard deviations (6,)."""
 
     id: str
-    translation_m: tuple[float, float, float]
-    turn_rad: float
     sigma: tuple[float, ...]
     corners: int | None
-    weighted_rms: float | None
     rival: bool
 
 

@@ -4,24 +4,16 @@ monitor would see from each mount of a grid: before a hole is drilled.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from gripmon.judge.drift import foresee
-from gripmon.judge.recalibrate import refusal
 from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.model.geometry import make_transform
-from gripmon.model.records import Array
-from gripmon.model.units import in_mm
-from gripmon.monitor import CORNER_COUNTS
-from gripmon.teach.accuracy import AccuracyForecast, Promise, forecast_frame
+from gripmon.model.geometry import make_transform, to_record
+from gripmon.model.records import Array, Transform
+from gripmon.teach.accuracy import Accuracy, forecast_frame
+from gripmon.teach.kept import Kept, foreseen
 from gripmon.teach.visibility import LandmarkView, Rig, border, moved_camera, see, sideways_m
 
 OPENINGS = 25
@@ -31,7 +23,7 @@ ACCURACY_OPENINGS = 3
 """Number of these at which accuracy and shifts are computed, besides the usual opening."""
 
 
-class Mount(NamedTuple):
+class Mount(msgspec.Struct, frozen=True):
     """Pose of a camera against the gripper, except for where in the image the TCP is.
 
     ``distance_m`` from the camera's centre to the TCP.  ``tilt_rad`` (0 to pi) between the camera's optical axis and
@@ -61,8 +53,8 @@ class Mount(NamedTuple):
             side = -turn
         return cls(float(np.linalg.norm(cam_T_grip[:3, 3])), float(tilt), float(side), float(roll))
 
-    def cam_T_grip(self, towards: Array) -> Array:
-        """The pose (4, 4) with the TCP in the direction ``towards`` (3,) of the camera frame."""
+    def pose(self, towards: Array) -> Array:
+        """``cam_T_grip`` (4, 4) with the TCP in the direction ``towards`` (3,) of the camera frame."""
         from scipy.spatial.transform import Rotation
 
         rotation = Rotation.from_euler("ZXZ", [self.roll_rad, self.tilt_rad, -self.side_rad]).as_matrix()
@@ -104,98 +96,65 @@ def field_of_view_rad(camera: Camera) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(left, right))), float(left @ right))
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """All combinations to try.  ``rigs`` differ in their lens; ``towards`` (one for each): direction of the TCP."""
-
-    distances_m: tuple[float, ...]
-    tilts_rad: tuple[float, ...]
-    sides_rad: tuple[float, ...]
-    rolls_rad: tuple[float, ...]
-    rigs: tuple[Rig, ...]
-    towards: tuple[Array, ...]
-
-    def __len__(self) -> int:
-        axes = (self.distances_m, self.tilts_rad, self.sides_rad, self.rolls_rad, self.rigs)
-        return math.prod(map(len, axes))
-
-    def mounts(self) -> Iterator[tuple[Mount, int]]:
-        """Each mount with the number of its lens."""
-        lenses = range(len(self.rigs))
-        for k, *angles, distance_m in itertools.product(
-            lenses, self.rolls_rad, self.sides_rad, self.tilts_rad, self.distances_m
-        ):
-            yield Mount(distance_m, *reversed(angles)), k
-
-
-class Fault(NamedTuple):
+class Fault(msgspec.Struct, frozen=True):
     """Why a mount would not work: ``kind`` without numbers, ``text`` with them."""
 
     kind: str
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class MeasurableMount:
-    """Results for a mount from which the monitor can measure at the usual opening; all for that opening unless stated
-    otherwise.
-
-    ``frame``: the accuracy of one frame.  ``worst_sigma_m``: standard deviation of the TCP along its least certain
-    direction, the largest over some openings, found at ``worst_at_m``.  ``promise`` of a frame; ``smallest`` (6,) steps
-    that are detected; ``delay_frames`` to detect a step of the TCP by the policy's ``warn_m`` along the worst axis
-    (None: never); ``margin_px`` of the visible corners to the border; ``shift_m``: sideways shift of the camera up to
-    which the monitor can measure, infinite for any.
+class OverJaw(msgspec.Struct, frozen=True):
+    """What is seen at openings: ``corners`` and ``edges`` at each, and the ``share`` of them at which the monitor can
+    measure.
     """
 
-    frame: AccuracyForecast
-    worst_sigma_m: float
-    worst_at_m: float
-    promise: Promise
-    smallest: Array
-    delay_frames: int | None
-    margin_px: float
-    shift_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """What the monitor would see from one mount.
-
-    ``sight`` at the usual opening.  ``corners``, ``edges`` (n,): their numbers at ``openings_m`` (n,); ``share``: part
-    of these openings at which the monitor can measure; ``measurable`` None where it can't at the usual one.
-    ``faults``: why this mount would not work, the most serious first; empty if it would.
-    """
-
-    mount: Mount
-    lens: int
-    cam_T_grip: Array
-    openings_m: Array
-    corners: NDArray[np.intp]
-    edges: NDArray[np.intp]
+    opening_m: tuple[float, ...]
+    corners: tuple[int, ...]
+    edges: tuple[int, ...]
     share: float
-    sight: LandmarkView
-    measurable: MeasurableMount | None
-    faults: tuple[Fault, ...]
 
-    @property
-    def works(self) -> bool:
-        return not self.faults
+
+class Trial(Mount, frozen=True):
+    """What the monitor would see from one mount, with one lens; ``faults``: why it would not work, the most serious
+    first, empty if it would.
+
+    At the usual opening unless stated otherwise: ``accuracy`` of one frame (None: too little is in view), and what it
+    ``promises``; ``worst_sigma_m``: standard deviation of the TCP along its least certain direction, the largest over
+    some openings, found at ``worst_at_m``; ``delay_frames`` to detect a step of the TCP by the policy's ``warn_m``
+    along the worst axis (None: never); ``margin_px`` of the visible corners to the border; ``shift_m``: sideways shift
+    of the camera up to which the monitor can measure, None for any.
+    """
+
+    image_px: tuple[int, int]
+    focal_px: float
+    field_of_view_rad: float | None
+    cam_T_grip: Transform
+    works: bool
+    faults: tuple[Fault, ...]
+    jaw: OverJaw
+    accuracy: Accuracy | None = None
+    promises: Kept | None = None
+    worst_sigma_m: float | None = None
+    worst_at_m: float | None = None
+    delay_frames: int | None = None
+    margin_px: float | None = None
+    shift_m: float | None = None
 
     @property
     def noticed_m(self) -> float:
         """The smallest step of the TCP that is detected along every axis; infinite where nothing can be measured."""
-        return float("inf") if self.measurable is None else float(self.measurable.smallest[:3].max())
+        drift = None if self.accuracy is None else self.accuracy.drift
+        return math.inf if drift is None else max(drift.smallest.tcp_m)
 
     @property
     def rank(self) -> tuple[float, ...]:
         """Sort key, smaller is better: first mounts that work, then more of the jaw's travel, then smaller steps."""
-        return (0.0, 0.0, self.noticed_m) if self.works else (1.0, -self.share, self.noticed_m)
+        return (0.0, 0.0, self.noticed_m) if self.works else (1.0, -self.jaw.share, self.noticed_m)
 
 
 def try_mount(
     rig: Rig,
     mount: Mount,
-    lens: int,
     cam_T_grip: Array,
     jaw_opening_m: float | None,
     travel_m: tuple[float, float] | None = None,
@@ -203,66 +162,65 @@ def try_mount(
     """The view from one mount.  ``jaw_opening_m`` is the usual one, None for a gripper without jaw; ``travel_m``: the
     part of the jaw's travel that counts, all if None.
     """
-    gripper = rig.gripper
+    gripper, camera = rig.gripper, rig.camera
     usual_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     low_m, high_m = travel_m or (gripper.jaw_min_m, gripper.jaw_max_m)
-    openings_m, chosen = np.array([usual_m]), []
+    openings_m, chosen = [usual_m], []
     if high_m > low_m:
-        openings_m = np.linspace(low_m, high_m, OPENINGS)
+        openings_m = np.linspace(low_m, high_m, OPENINGS).tolist()
         chosen = np.linspace(0, OPENINGS - 1, ACCURACY_OPENINGS).round().astype(int).tolist()
-    sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m.tolist()]
+    sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m]
     sight = see(rig, cam_T_grip, usual_m)
-    some_m = [float(openings_m[k]) for k in chosen if sights[k].enough]
-    measurable = _measurable(rig, cam_T_grip, usual_m, sight, some_m) if sight.enough else None
-    return Trial(
-        mount,
-        lens,
-        cam_T_grip,
-        openings_m,
-        np.array([s.corners for s in sights], dtype=np.intp),
-        np.array([s.edges for s in sights], dtype=np.intp),
-        float(np.mean([s.enough for s in sights])),
-        sight,
-        measurable,
-        (
+    some_m = [openings_m[k] for k in chosen if sights[k].enough]
+    angle = field_of_view_rad(camera)
+    trial = Trial(
+        **msgspec.structs.asdict(mount),
+        image_px=(camera.width_px, camera.height_px),
+        focal_px=camera.fx_px,
+        field_of_view_rad=None if math.isnan(angle) else angle,
+        cam_T_grip=to_record(cam_T_grip),
+        works=False,
+        faults=(
             *_too_little_in_view(openings_m, sights, sight),
             *_after_a_shift(rig, cam_T_grip, [usual_m] * sight.enough + some_m),
-            *(() if measurable is None else _inexact(rig, measurable, usual_m)),
+        ),
+        jaw=OverJaw(
+            tuple(openings_m),
+            tuple(s.corners for s in sights),
+            tuple(s.edges for s in sights),
+            float(np.mean([s.enough for s in sights])),
         ),
     )
+    if sight.enough:
+        trial = _measured(rig, trial, cam_T_grip, usual_m, sight, some_m)
+    return msgspec.structs.replace(trial, works=not trial.faults)
 
 
-def tried(grid: Grid, jaw_opening_m: float | None, travel_m: tuple[float, float] | None = None) -> Iterator[Trial]:
-    """Try every mount of a grid, one after the other."""
-    for mount, k in grid.mounts():
-        yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m, travel_m)
-
-
-def _measurable(
-    rig: Rig, cam_T_grip: Array, usual_m: float, sight: LandmarkView, openings_m: list[float]
-) -> MeasurableMount:
-    """The results, with the worst standard deviation over the usual opening and ``openings_m``."""
-    policy = rig.settings.policy
+def _measured(
+    rig: Rig, trial: Trial, cam_T_grip: Array, usual_m: float, sight: LandmarkView, openings_m: list[float]
+) -> Trial:
+    """The same with what a frame shows; with the worst standard deviation over the usual opening and ``openings_m``."""
     frame, nearest = forecast_frame(rig, cam_T_grip, usual_m), border(rig, sight)
-    assert nearest is not None, "enough in view has corners in view"
+    assert nearest is not None and frame.drift is not None, "enough in view has corners in view"
     each = [(usual_m, frame), *((m, forecast_frame(rig, cam_T_grip, m)) for m in openings_m)]
-    sigma_m, at_m = max((f.tcp_sigma_m, m) for m, f in each)
-    detectable = foresee(frame.covariance, rig.settings.drift)
-    delays = [detectable.delay_frames(policy.warn_m, axis) for axis in range(3)]
-    known = [d for d in delays if d is not None]
-    return MeasurableMount(
-        frame,
-        sigma_m,
-        at_m,
-        Promise.of(frame.protection, policy),
-        detectable.smallest,
-        max(known) if len(known) == len(delays) else None,
-        nearest.smallest_px,
-        sideways_m(rig, cam_T_grip, usual_m),
+    sigma_m, at_m = max((f.tcp_sigma_m or 0.0, m) for m, f in each)
+    delays = frame.drift.delay_frames[f"{rig.settings.policy.warn_m:g}"]
+    known = [delay for delay in delays if delay is not None]
+    promises, shift_m = foreseen(frame, rig), sideways_m(rig, cam_T_grip, usual_m)
+    return msgspec.structs.replace(
+        trial,
+        faults=(*trial.faults, *_inexact(rig, frame, promises, usual_m)),
+        accuracy=frame,
+        promises=promises,
+        worst_sigma_m=sigma_m,
+        worst_at_m=at_m,
+        delay_frames=max(known) if len(known) == len(delays) else None,
+        margin_px=nearest.smallest_px,
+        shift_m=None if math.isinf(shift_m) else shift_m,
     )
 
 
-def _too_little_in_view(openings_m: Array, sights: list[LandmarkView], sight: LandmarkView) -> tuple[Fault, ...]:
+def _too_little_in_view(openings_m: list[float], sights: list[LandmarkView], sight: LandmarkView) -> tuple[Fault, ...]:
     failed = [k for k, s in enumerate(sights) if not s.enough]
     if len(failed) == len(sights) and sight.reason is not None:
         return (Fault("nowhere enough in view", f"nowhere enough to measure: {sight.reason}"),)
@@ -291,16 +249,14 @@ def _after_a_shift(rig: Rig, cam_T_grip: Array, openings_m: list[float]) -> tupl
     return ()
 
 
-def _inexact(rig: Rig, found: MeasurableMount, usual_m: float) -> tuple[Fault, ...]:
+def _inexact(rig: Rig, frame: Accuracy, promises: Kept, usual_m: float) -> tuple[Fault, ...]:
     """Whether no measured transform would be valid, or recalibration past the limit would be impossible."""
-    faults, settings, gripper = [], rig.settings, rig.gripper
-    if not found.promise.reachable:
-        where = f" at {1e3 * usual_m:.1f} mm of opening" if gripper.has_jaw else ""
-        bound = f"bound on the TCP's error {in_mm(found.promise.protection.position_m)} mm{where}"
-        text = f"{bound}: needs {found.promise.needed}"
-        faults.append(Fault("no transform would be valid: the bound on its error is above the alert limit", text))
-    if settings.recalibration.mode != "off":
-        taken = gripper.innermost_corners(found.frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
-        if (why := refusal(gripper.points_grip_m(None)[gripper.corner_points][taken])) is not None:
-            faults.append(Fault("its corners give no new pose past the limit", f"no new pose past the limit: {why}"))
+    faults, new_pose = [], frame.recalibration
+    if not promises.reachable:
+        where = f" at {1e3 * usual_m:.1f} mm of opening" if rig.gripper.has_jaw else ""
+        kind = "no transform would be valid: the bound on its error is above the alert limit"
+        faults.append(Fault(kind, f"{promises.text()}{where}: needs {promises.needed()}"))
+    if new_pose.mode != "off" and new_pose.reason is not None:
+        text = f"no new pose past the limit: {new_pose.reason}"
+        faults.append(Fault("its corners give no new pose past the limit", text))
     return tuple(faults)

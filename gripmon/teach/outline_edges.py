@@ -140,7 +140,6 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
         found.step[near],
         sample,
         np.zeros(len(sample), np.intp),
-        np.flatnonzero(near),
         np.array([int(ok.sum())]),
     )
     worth = np.sqrt(np.abs(points.step))

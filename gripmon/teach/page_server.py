@@ -346,11 +346,9 @@ class OutlineSession:
     def state(self) -> State:
         height_px, width_px = self._picture.image.shape[:2]
         return State(
-            version=__version__,
             width_px=width_px,
             height_px=height_px,
             corners=_NAMES,
-            fingers={name: name.partition("_")[0] for name in _NAMES},
             places=_columns(width_px, height_px),
             pictures=(PictureInfo(number=0, name=self._picture.name, jaw_opening_m=None),),
             live=None,

@@ -18,19 +18,16 @@ from typing import NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from gripmon import __version__
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.io.sources import Source, Waiting
-from gripmon.judge.drift import foresee
 from gripmon.judge.inspection import inspect
-from gripmon.judge.recalibrate import refusal
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, rotation_angle, to_record
+from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
-from gripmon.monitor import CORNER_COUNTS, MonitorSettings
-from gripmon.teach.accuracy import Promise, forecast_accuracy
+from gripmon.monitor import MonitorSettings
+from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.api import Picture
 from gripmon.teach.corner_pose import (
     CornerPose,
@@ -44,6 +41,7 @@ from gripmon.teach.corner_pose import (
     prior_of,
     usual_view,
 )
+from gripmon.teach.kept import promise_of
 from gripmon.teach.measure import Taught, teach
 from gripmon.teach.messages import (
     BadRequest,
@@ -68,7 +66,6 @@ from gripmon.track.edges.taught import own_covariance
 
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
-_STEP_M = 1e-4  # step of the TCP for which the delay is given
 
 
 class Evaluation(NamedTuple):
@@ -139,22 +136,12 @@ class Setup:
         opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
         with contextlib.suppress(TeachingRefused):
             taught = self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
-        frame = forecast_accuracy(self.camera, gripper, settings, reference, jaw_opening_m, taught)
+        rig, cam_T_grip = Rig(self.camera, gripper, settings, taught), from_record(reference.cam_T_grip)
+        frame = forecast_frame(rig, cam_T_grip, jaw_opening_m, with_jaw=True)
         if not frame.enough:
             return None
-        detectable = foresee(frame.covariance, settings.drift)
-        taken = gripper.innermost_corners(frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
-        promise = Promise.of(frame.protection, settings.policy)
-        return Expectation(
-            edges=frame.edges,
-            sigma=tuple(frame.sigma.tolist()),
-            weakest=tuple(frame.weakest.tolist()),
-            smallest=tuple(detectable.smallest.tolist()),
-            promise=promise.text(),
-            reachable=promise.reachable,
-            delay_frames=tuple(detectable.delay_frames(_STEP_M, axis) for axis in range(3)),
-            recalibration=refusal(gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]),
-        )
+        promise = promise_of(rig, cam_T_grip, jaw_opening_m, frame)
+        return Expectation(accuracy=frame, promise=f"forecast: {promise.promise()}", reachable=promise.reachable)
 
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
         """Teach from the images.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
@@ -231,13 +218,10 @@ class TeachSession:
     def state(self) -> State:
         setup, gripper = self._setup, self._setup.gripper
         opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
-        finger = gripper.point_finger[gripper.corner_points].tolist()
         return State(
-            version=__version__,
             width_px=setup.camera.width_px,
             height_px=setup.camera.height_px,
             corners=gripper.corner_ids,
-            fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
             places={name: _place(at) for name, at in setup.first_places(opening_m).items()},
             pictures=self._infos(),
             has_jaw=gripper.has_jaw,
@@ -370,11 +354,8 @@ def reply(found: Evaluation) -> Reply:
 def _reference_reply(reference: ReferenceRecord, pose: CornerPose | None) -> ReferenceReply:
     return ReferenceReply(
         id=reference.reference_id,
-        translation_m=reference.cam_T_grip.translation_m,
-        turn_rad=rotation_angle(from_record(reference.cam_T_grip)[:3, :3]),
         sigma=tuple(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()).tolist()),
         corners=None if pose is None else len(pose.corners),
-        weighted_rms=None if pose is None else pose.weighted_rms,
         rival=pose is not None and pose.rival,
     )
 

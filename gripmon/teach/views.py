@@ -73,16 +73,14 @@ class TeachingImage:
 class View:
     """One image, sampled along all edges in view, with their predictions at the reference.
 
-    ``prediction``: from the pose at which it was sampled, with its ``profiles`` (n, s) in grey levels and edge
-    ``candidates``; ``at_reference`` predicts the same samples at the reference, but for the image's play, and the
-    reported opening; ``offset_m``
-    (k,): offset of each candidate from there across the line of sight; ``expected_m`` (n,): that of the samples;
+    ``prediction``: from the pose at which it was sampled, with its edge ``candidates``; ``at_reference`` predicts the
+    same samples at the reference, but for the image's play, and the reported opening; ``offset_m`` (k,): offset of each
+    candidate from there across the line of sight; ``expected_m`` (n,): that of the samples;
     ``per_m`` (n,): px per metre.
     """
 
     image: TeachingImage
     prediction: Prediction
-    profiles: NDArray[np.float32]
     candidates: Candidates
     at_reference: Prediction
     offset_m: Array
@@ -190,7 +188,7 @@ class Viewer:
         sample = candidates.sample
         across = np.einsum("ni,ni->n", there.normal, here.normal)
         offset_px = expected_px[sample] + candidates.offset_px * across[sample]
-        return View(image, there, profiles, candidates, here, offset_px / per_m[sample], expected_px / per_m, per_m)
+        return View(image, there, candidates, here, offset_px / per_m[sample], expected_px / per_m, per_m)
 
     def _predict(
         self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
@@ -271,13 +269,13 @@ def sampled(views: Sequence[View], edge: int) -> SampledEdge | None:
         own = np.flatnonzero(layout.edge[candidates.sample] == edge)
         sample = candidates.sample[own]
         image = np.full(len(own), number)
-        parts.append((layout.fraction[sample], view.offset_m[own], candidates.step[own], before + sample, image, own))
+        parts.append((layout.fraction[sample], view.offset_m[own], candidates.step[own], before + sample, image))
         before += len(layout.edge)
     if not spans:
         return None
     low, high = np.median(spans, axis=0).tolist()
     per_m = float(np.mean(scales))
-    fraction, offset_m, step, profile, image, own = (np.concatenate(part) for part in zip(*parts, strict=True))
+    fraction, offset_m, step, profile, image = (np.concatenate(part) for part in zip(*parts, strict=True))
     way = (fraction - low) / (high - low)
-    points = EdgePoints(way, per_m * offset_m, step, profile, image, own, np.array(profiles))
+    points = EdgePoints(way, per_m * offset_m, step, profile, image, np.array(profiles))
     return SampledEdge(points, (low, high), per_m, per_m * np.mean(expected, axis=0), np.mean(rows, axis=0))

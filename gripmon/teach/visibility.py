@@ -176,8 +176,16 @@ SOUGHT_M = 1.0
 SOUGHT_RAD = np.pi
 """Largest turn of the camera that is examined."""
 
-STEP_PX = 16.0
-"""Image motion between two views that are examined; a narrower gap in the view may be missed."""
+SHIFTS_M = np.geomspace(0.002, SOUGHT_M, 81)
+"""Shifts that are examined, each 8 % longer than the one before: some 20 px in the image where a view usually ends, at
+30 mm.  A narrower gap in the view may be missed.
+"""
+
+TURNS_RAD = np.linspace(0.03, SOUGHT_RAD, 104)
+"""Turns that are examined: some 30 px in the image."""
+
+HALVINGS = 12
+"""Of the step in which a view ends: some micrometres are left of it."""
 
 TwoSided = tuple[float | None, float | None]
 """Amounts in negative and in positive direction; None: beyond the range that was searched."""
@@ -231,28 +239,29 @@ def border(rig: Rig, sight: LandmarkView) -> Border | None:
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
-    """How far the camera may shift and turn along each of its axes at a fixed jaw opening, to 1/4000 of a step: some
-    micrometres.
-    """
+    """How far the camera may shift and turn along each of its axes at a fixed jaw opening."""
     found = [[_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for sign in (-1.0, 1.0)] for axis in np.eye(6)]
-    amounts: list[TwoSided] = [(low[0], high[0]) for low, high in found]
-    reasons = [(low[1], high[1]) for low, high in found]
-    shift_m, turn_rad = (dict(zip("xyz", part, strict=True)) for part in (amounts[:3], amounts[3:]))
-    shift_reason, turn_reason = (dict(zip("xyz", part, strict=True)) for part in (reasons[:3], reasons[3:]))
-    return Freedom(shift_m, turn_rad, shift_reason, turn_reason)
+    amounts, reasons = ([(low[k], high[k]) for low, high in found] for k in (0, 1))
+    parts = amounts[:3], amounts[3:], reasons[:3], reasons[3:]
+    return Freedom(*(dict(zip("xyz", part, strict=True)) for part in parts))  # type: ignore[arg-type]
 
 
 def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> float:
     """The shortest shift of the camera along its x or y, in either direction, after which the monitor can't measure;
-    infinite if there is none.  The steps are coarser than those of :func:`freedom`, the result good to 1/100 of a step.
+    infinite if there is none.  In coarser steps than :func:`freedom`, good to 1/500 of the shift.
     """
     axes = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
-    limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, 4.0 * STEP_PX, halvings=7)[0] for axis in axes]
+    limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, SHIFTS_M[::4], halvings=7)[0] for axis in axes]
     return min((limit for limit in limits if limit is not None), default=math.inf)
 
 
 def _limit(
-    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 12
+    rig: Rig,
+    cam_T_grip: Array,
+    jaw_opening_m: float | None,
+    axis: Array,
+    amounts: Array | None = None,
+    halvings: int = HALVINGS,
 ) -> tuple[float | None, str | None]:
     """The amount of a motion along the unit vector ``axis`` (6,) after which the view doesn't suffice, and why; None if
     it always does.
@@ -261,48 +270,24 @@ def _limit(
     def view(amount: float) -> LandmarkView:
         return see(rig, moved_camera(cam_T_grip, amount * axis), jaw_opening_m)
 
-    sought = SOUGHT_M if axis[:3].any() else SOUGHT_RAD
-    good, bad = 0.0, 0.0
-    sight = view(0.0)
-    if (reason := sight.reason) is not None:
-        return 0.0, reason
-    while sight.enough:
-        if bad >= sought:
-            return None, None
-        good = bad
-        bad = min(bad + _step(rig, cam_T_grip, jaw_opening_m, axis, good, sight, step_px), sought)
-        sight = view(bad)
-    bad, sight = _first_failing(good, bad, sight, view, halvings)
-    return bad, sight.reason
+    if amounts is None:
+        amounts = TURNS_RAD if axis[3:].any() else SHIFTS_M
+    good = 0.0
+    for amount in [0.0, *amounts.tolist()]:
+        if not (sight := view(amount)).enough:
+            bad, sight = first_failing(good, amount, sight, view, halvings)
+            return bad, sight.reason
+        good = amount
+    return None, None
 
 
-def _step(
-    rig: Rig,
-    cam_T_grip: Array,
-    jaw_opening_m: float | None,
-    axis: Array,
-    amount: float,
-    sight: LandmarkView,
-    step_px: float,
-) -> float:
-    """Next step: it moves the visible corners by ``step_px`` at most."""
-    gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
-    points_m = gripper.points_grip_m(jaw_opening_m)[gripper.landmarks[sight.visible]]
-    pose = moved_camera(cam_T_grip, (amount + small) * axis)
-    moved_px = rig.camera.project(points_m @ pose[:3, :3].T + pose[:3, 3]) - sight.uv_px[sight.visible]
-    rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / small
-    # Close to the lens's axis a shift along it moves nothing at first.
-    farthest = 0.05 if axis[3:].any() else 0.02 * (1.0 + 50.0 * amount)
-    return min(step_px / max(rate, 1e-12), farthest)
-
-
-def _first_failing(
-    good: float, bad: float, there: LandmarkView, view: Callable[[float], LandmarkView], halvings: int
+def first_failing(
+    good: float, bad: float, there: LandmarkView, view: Callable[[float], LandmarkView], halvings: int = HALVINGS
 ) -> tuple[float, LandmarkView]:
     """Bisect between a value whose view suffices and one whose view, ``there``, doesn't: the failing value found that
     is nearest to the former, and its view.
     """
-    for _ in range(halvings):
+    for _ in range(halvings if good != bad else 0):
         middle = 0.5 * (good + bad)
         sight = view(middle)
         if sight.enough:
@@ -310,62 +295,3 @@ def _first_failing(
         else:
             bad, there = middle, sight
     return bad, there
-
-
-class Gap(msgspec.Struct, frozen=True):
-    """A range of openings in which the view doesn't suffice, and the reason (in its middle)."""
-
-    from_m: float
-    to_m: float
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class JawTravel:
-    """``share`` of the jaw's travel in which the monitor can measure, and the ``gaps`` in it; ``corners`` and ``edges``
-    (n,): their visible numbers at the ``openings_m`` (n,).
-    """
-
-    share: float
-    gaps: tuple[Gap, ...]
-    openings_m: Array
-    corners: NDArray[np.intp]
-    edges: NDArray[np.intp]
-
-
-def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
-    """What is visible at ``count`` openings over the whole travel, with the ends of gaps refined between them; None for
-    a gripper whose jaw doesn't move.  A failure only between two openings is missed.
-    """
-    gripper = rig.gripper
-    if not gripper.jaw_max_m > gripper.jaw_min_m:
-        return None
-
-    def view(opening_m: float) -> LandmarkView:
-        return see(rig, cam_T_grip, opening_m)
-
-    openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, count)
-    sights = list(map(view, openings_m.tolist()))
-    gaps = _gaps(openings_m.tolist(), sights, view)
-    lost_m = sum(gap.to_m - gap.from_m for gap in gaps)
-    share = 1.0 - lost_m / (gripper.jaw_max_m - gripper.jaw_min_m)
-    corners, edges = np.array([(s.corners, s.edges) for s in sights], dtype=np.intp).T
-    return JawTravel(max(share, 0.0), gaps, openings_m, corners, edges)
-
-
-def _gaps(
-    openings_m: list[float], sights: list[LandmarkView], view: Callable[[float], LandmarkView]
-) -> tuple[Gap, ...]:
-    """The runs of openings without a sufficient view, their ends found by bisection."""
-    change = np.flatnonzero(np.diff([1, *(int(sight.enough) for sight in sights), 1]))
-    gaps = []
-    for first, beyond in change.reshape(-1, 2).tolist():
-        low_m, high_m = openings_m[first], openings_m[beyond - 1]
-        if first > 0:
-            low_m, _ = _first_failing(openings_m[first - 1], low_m, sights[first], view, 14)
-        if beyond < len(openings_m):
-            high_m, _ = _first_failing(openings_m[beyond], high_m, sights[beyond - 1], view, 14)
-        reason = sights[(first + beyond - 1) // 2].reason
-        assert reason is not None
-        gaps.append(Gap(low_m, high_m, reason))
-    return tuple(gaps)

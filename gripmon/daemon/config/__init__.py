@@ -26,6 +26,7 @@ from gripmon.daemon.config.checks import (
     view_fault,
 )
 from gripmon.daemon.config.earlier import without_gone
+from gripmon.daemon.config.project import file_of
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
@@ -140,13 +141,13 @@ class Config:
 def load_config(
     path: str | Path, *, check_source: bool = True, with_taught: bool = True, say_gone: bool = True
 ) -> Config:
-    """Read and check a configuration file.  Raises :class:`ConfigError`.
+    """Read and check a configuration, a file or a project's folder that holds one.  Raises :class:`ConfigError`.
 
     ``check_source=False``: don't check that the source's files exist, for callers with their own input;
     ``with_taught=False``: ignore the taught model, for callers that teach it again; ``say_gone=False``: of settings
     that are gone only those that had an effect are told, for files that can't be edited.
     """
-    path = Path(path)
+    path = file_of(Path(path), "config")
     values = read_configuration(path)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)

@@ -11,7 +11,7 @@ import msgspec
 import gripmon
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
 from gripmon.model.fields import described
-from gripmon.model.yaml_text import YamlFault, parse_yaml, yaml_value
+from gripmon.model.yaml_text import YamlFault, parse_yaml, plain_value
 
 _T = TypeVar("_T")
 _LINES, _SEE = "`key: value` lines, indented with blanks", "`key: value` lines; see configs/demo.yaml"
@@ -82,9 +82,6 @@ def builtin_config(name: str) -> Path:
 
 def read_configuration(path: Path) -> dict[str, Any]:
     """The mapping in a configuration.  :class:`ConfigError`, which names the type of any other gripmon file."""
-    inside = path / "config.yaml"  # as gripmon teach and setup name it
-    if inside.is_file():
-        raise ConfigError(path, "", "is a folder", f"the configuration in it, {inside}")
     if path.parts[:1] == ("configs",) and not path.exists():  # as examples name them, in a checkout
         with contextlib.suppress(FileNotFoundError):
             shipped = builtin_config(str(path.relative_to("configs")))
@@ -152,7 +149,7 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
     lines = []
     tag = type(settings).__struct_config__
     if tag.tag_field is not None and not off:
-        lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
+        lines.append(_line(indent, tag.tag_field, plain_value(tag.tag), "", off))
     section = msgspec.inspect.type_info(type(settings))
     assert isinstance(section, msgspec.inspect.StructType)
     for field in section.fields:
@@ -164,7 +161,7 @@ def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) ->
             lines.append(lines_of(value, indent + 2, off=off))
             continue
         description = described(field.type)
-        lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
+        lines.append(_line(indent, field.encode_name, plain_value(value), description, off))
     return "\n".join(lines)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from gripmon.daemon.config.project import FILES
 from gripmon.daemon.targets import target_of
 from gripmon.model.errors import InputError
 from gripmon.model.targets import OtherSizeError, Target, TargetError, name_of, parse_target, refuse_other_size
@@ -16,7 +17,7 @@ from gripmon.model.targets import OtherSizeError, Target, TargetError, name_of, 
 Values = Mapping[str, str]
 PRINT_IT, HAVE_ONE = "print it", "I have one"
 INFERRED, FROM_FILE, FROM_CAD, FROM_IMAGES = "from the plate", "a file", "from CAD", "from images"
-LENS, HAND_EYE = "camera.yaml", "hand_eye.yaml"
+LENS, HAND_EYE = FILES["camera"], FILES["reference"]
 ON_PLATE, BY_CORNERS, BY_IMAGES = "on the plate", "from corners alone", "with the gripper's images"
 
 

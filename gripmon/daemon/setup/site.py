@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon import __version__
 from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture, CaptureState
 from gripmon.daemon.setup.lines import Line
@@ -80,7 +79,6 @@ class StepCard(msgspec.Struct, frozen=True, kw_only=True):
 class SetupState(msgspec.Struct, frozen=True, kw_only=True):
     """``busy``: the step being carried out; ``capture``: of the step ``capturing``, whose camera runs or ran last."""
 
-    version: str
     folder: str
     busy: str | None
     steps: tuple[StepCard, ...]
@@ -147,7 +145,6 @@ class SetupSite:
         capturing = self._capture
         states = self._project.states()
         return SetupState(
-            version=__version__,
             folder=str(self._project.folder),
             busy=self._busy,
             steps=tuple(self._card(step, state) for step, state in zip(STEPS, states, strict=True)),

@@ -145,46 +145,27 @@ def _wants(sightings: Sequence[Sighting], tilts: Array, size_px: tuple[int, int]
 
 
 def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
-    """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down).
+    """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down); 0 for
+    too few points.
 
-    An approximation for people: the camera isn't known yet.  One focal length for all views, from the plate's axes
-    being orthogonal and equally long (Zhang, "A flexible new technique for camera calibration", 2000), principal point
-    at the centre, square pixels, no distortion; if the views don't determine it, the image's width.
+    An approximation for people: the camera isn't known yet.  One focal length for all views (OpenCV's start of a
+    calibration: square pixels, principal point at the centre, no distortion); if fewer than three determine it, the
+    image's width.
     """
-    planes = [_homography(sighting, size_px) for sighting in sightings]
-    known = [plane for plane in planes if plane is not None]
-    focal = _focal(known) or float(size_px[0])
-    out = np.zeros((len(planes), 2))
-    for k, plane in enumerate(planes):
-        if plane is None:
+    out, seen = np.zeros((len(sightings), 2)), [s for s in sightings if len(s) >= 4]
+    centre = 0.5 * (np.array(size_px) - 1.0)
+    camera = np.array([[size_px[0], 0.0, centre[0]], [0.0, size_px[0], centre[1]], [0.0, 0.0, 1.0]])
+    if len(seen) >= 3:
+        points = [[np.asarray(part, np.float32) for part in (s.plate_m, s.uv_px)] for s in seen]
+        found = cv2.initCameraMatrix2D(*zip(*points, strict=True), size_px)  # type: ignore[call-overload]
+        camera = found if np.isfinite(found).all() and found[0, 0] > 0.0 else camera
+    for k, sighting in enumerate(sightings):
+        if len(sighting) < 4:
             continue
-        axes = np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ plane
-        axes = axes[:, :2] / np.linalg.norm(axes[:, :2], axis=0)
-        normal = np.cross(axes[:, 0], axes[:, 1])
-        normal /= np.linalg.norm(normal) * np.sign(normal[2] or 1.0)  # away from the camera
+        _, turn, _ = cv2.solvePnP(sighting.plate_m, sighting.uv_px, camera, None, flags=cv2.SOLVEPNP_IPPE)
+        normal = np.asarray(cv2.Rodrigues(turn)[0])[:, 2]
+        normal = normal * np.sign(normal[2] or 1.0)  # away from the camera
         across = float(np.linalg.norm(normal[:2]))
         # Depth increases against the normal's component in the image.
         out[k] = -normal[:2] / max(across, 1e-9) * math.atan2(across, float(normal[2]))
     return out
-
-
-def _homography(sighting: Sighting, size_px: tuple[int, int]) -> Array | None:
-    """(3, 3) from the plate to the image, px from its centre; None if the points don't span an area."""
-    if len(sighting) < 4:
-        return None
-    plate = sighting.plate_m[:, :2] - sighting.plate_m[:, :2].mean(axis=0)
-    plane, _ = cv2.findHomography(plate, sighting.uv_px - 0.5 * (np.array(size_px) - 1.0))
-    return None if plane is None else np.asarray(plane, np.float64)
-
-
-def _focal(planes: Sequence[Array]) -> float | None:
-    """Focal length (px); None if these views don't determine it."""
-    if len(planes) < 3:
-        return None
-    terms, rests = [], []
-    for plane in planes:
-        (a1, a2), (b1, b2), (c1, c2) = (plane[:, :2] / np.linalg.norm(plane[:2, :2])).tolist()
-        terms += [a1 * a2 + b1 * b2, a1**2 + b1**2 - a2**2 - b2**2]
-        rests += [c1 * c2, c1**2 - c2**2]
-    inverse_square = -float(np.dot(terms, rests)) / max(float(np.dot(terms, terms)), 1e-30)
-    return 1.0 / math.sqrt(inverse_square) if inverse_square > 0.0 else None

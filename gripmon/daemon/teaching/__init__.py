@@ -5,13 +5,11 @@ configuration that runs.  It is here because it needs configurations, which the 
 from gripmon.daemon.teaching.inputs import Inputs, outline_session, read_inputs
 from gripmon.daemon.teaching.saving import FileSaving, page_session, teach_from_file
 from gripmon.daemon.teaching.words import in_words
-from gripmon.daemon.teaching.written import name_taught
 
 __all__ = [
     "FileSaving",
     "Inputs",
     "in_words",
-    "name_taught",
     "outline_session",
     "page_session",
     "read_inputs",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -17,9 +16,11 @@ from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
 from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config.project import FILES
+from gripmon.daemon.config.writing import with_taught
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
-from gripmon.daemon.teaching.written import config_text, with_taught
+from gripmon.daemon.teaching.written import config_text
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
@@ -34,7 +35,7 @@ from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtEdges, TaughtModel
 
-TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
+TAUGHT, CONFIG, CORNERS, IMAGES = FILES["taught"], FILES["config"], "corners.yaml", "teaching"
 
 
 class FileSaving:
@@ -188,12 +189,8 @@ class FileSaving:
     def _config(self, order: SaveOrder, found: Evaluation, taught: bool) -> str:
         given = self._inputs.config
         if given is not None:
-            return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
-        return config_text(self._inputs, order, found, TAUGHT if taught else None, self._relative)
-
-    def _relative(self, path: Path, to: Path | None = None) -> str:
-        """The path relative to ``to``, or to the output folder."""
-        return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
+            return with_taught(given.path, self._paths["taught"])
+        return config_text(self._inputs, order, found, TAUGHT if taught else None)
 
     def _try_out(self, texts: Mapping[str, str]) -> None:
         """Check in a temporary folder that the configuration is valid; otherwise nothing is written."""
@@ -205,14 +202,12 @@ class FileSaving:
             trial.write_text(texts["config"], encoding="utf-8")
             try:
                 values = read_yaml(trial)
-                values["gripper"] = str((base / values["gripper"]).resolve())
+                for key in ("gripper", "camera", "reference"):
+                    if isinstance(values.get(key), str):
+                        values[key] = str((base / values[key]).resolve())
                 if "taught" in texts:
                     (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
                     values["taught"] = TAUGHT
-                for key in ("camera", "reference"):
-                    if isinstance(values.get(key), str):
-                        shutil.copy(base / values[key], Path(name) / f"{key}.yaml")
-                        values[key] = f"{key}.yaml"
                 trial.write_text(as_yaml(values), encoding="utf-8")
                 load_config(trial, check_source=False, with_taught="taught" in texts)
             except (ConfigError, yaml.YAMLError, OSError) as error:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from gripmon.teach.accuracy import PoseValues
 from gripmon.teach.session import Evaluation
 
 
@@ -33,14 +32,14 @@ def in_words(found: Evaluation) -> list[str]:
             )
             lines.append(f"note: {rival}")
     expected = found.expected
-    if expected is not None:
-        lines.append(f"expected of a frame   {_axes(expected.sigma)}")
-        lines.append(f"smallest drift        {_axes(expected.smallest)}")
+    if expected is not None and expected.accuracy.expected is not None and expected.accuracy.drift is not None:
+        lines.append(f"expected of a frame   {_axes(expected.accuracy.expected)}")
+        lines.append(f"smallest drift        {_axes(expected.accuracy.drift.smallest)}")
         lines.append(f"promise               {expected.promise}")
     return lines
 
 
-def _axes(values: object) -> str:
-    x, y, z, a, b, c = np.asarray(values, dtype=float).tolist()
-    turns = ", ".join(f"{math.degrees(v):.3f}" for v in (a, b, c))
+def _axes(values: PoseValues) -> str:
+    x, y, z = values.tcp_m
+    turns = ", ".join(f"{math.degrees(v):.3f}" for v in values.rotation_rad)
     return f"TCP x {1e3 * x:.3f}, y {1e3 * y:.3f}, z {1e3 * z:.3f} mm, turns {turns}°"

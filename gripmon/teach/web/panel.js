@@ -95,15 +95,15 @@ export function expected(reply, state) {
   const values = reply?.expected, reference = reply?.reference;
   $("#expected").hidden = !values;
   if (!values) return;
-  const shown = (all, from, words) => all.slice(from, from + 3).map(words);
+  const { expected: sigma, drift, recalibration } = values.accuracy;
   const rows = [
-    ["one frame ±", shown(values.sigma, 0, mm), "mm"],
-    ["smallest drift", shown(values.smallest, 0, mm), "mm"],
-    ["rotation ±", shown(values.sigma, 3, degrees), "°"],
-    ["smallest turn", shown(values.smallest, 3, degrees), "°"],
+    ["one frame ±", sigma.tcp_m.map(mm), "mm"],
+    ["smallest drift", drift.smallest.tcp_m.map(mm), "mm"],
+    ["rotation ±", sigma.rotation_rad.map(degrees), "°"],
+    ["smallest turn", drift.smallest.rotation_rad.map(degrees), "°"],
   ];
-  if (reference && !state.reference) rows.push(["reference ±", shown(reference.sigma, 0, mm), "mm"]);
-  const weakest = values.sigma.slice(0, 3).indexOf(Math.max(...values.sigma.slice(0, 3)));
+  if (reference && !state.reference) rows.push(["reference ±", reference.sigma.slice(0, 3).map(mm), "mm"]);
+  const weakest = sigma.tcp_m.indexOf(Math.max(...sigma.tcp_m));
   $("#accuracy tbody").replaceChildren(...rows.map(([name, numbers, unit], k) => {
     const row = element("tr");
     const cells = numbers.map((text, axis) => element("td", text, k < 2 && axis === weakest ? { class: "weakest" } : {}));
@@ -112,11 +112,11 @@ export function expected(reply, state) {
   }));
   $("#promise").textContent = `${values.promise[0].toUpperCase()}${values.promise.slice(1)}.`;
   $("#promise").classList.toggle("warn", !values.reachable);
-  const delays = values.delay_frames.map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `within ${frames} frames`}`);
+  const delays = drift.delay_frames["0.0001"].map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `within ${frames} frames`}`);
   const notes = [`A step of the TCP by 0.1 mm is detected on average: ${delays.join(", ")}.`];
   if (reference?.rival) notes.push("Another pose explains these corners as well: place one outside of their plane.");
   if (reference && !state.reference) notes.push("The reference comes from these corners; a plate (gripmon calibrate plane) measures it more accurately.");
-  if (values.recalibration) notes.push(`No new pose from corners later: ${values.recalibration}.`);
+  if (recalibration.reason) notes.push(`No new pose from corners later: ${recalibration.reason}.`);
   $("#expected-note").textContent = notes.join(" ");
 }
 

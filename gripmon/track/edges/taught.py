@@ -82,15 +82,6 @@ class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     images_covariance: Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)] | None = None
 
 
-class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Grey level of the finger beside an edge, divided by the median of all edges (no unit), and its robust spread
-    along the edge.
-    """
-
-    level: Annotated[float, Meta(ge=0.0)]
-    spread: Annotated[float, Meta(ge=0.0)]
-
-
 class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One edge: ``offset_m`` and ``sigma_m`` at the two ends ``share`` of the visible part, linear between them, and
     its depth behind the model's edge.
@@ -105,8 +96,9 @@ class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     brighter: Literal["left", "right", "any"] = "any"
     rms_px: Annotated[float, Meta(ge=0.0, description="of the edge points about the taught line (px)")] = 0.0
     seen: Annotated[float, Meta(ge=0.0, le=1.0, description="part of its search lines that showed it")] = 1.0
-    left: Look | None = None
-    right: Look | None = None
+    left: dict[str, float] | None = None
+    right: dict[str, float] | None = None
+    """In files of earlier versions, the finger's grey level on that side; not used."""
 
 
 _UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
