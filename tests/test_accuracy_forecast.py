@@ -12,7 +12,7 @@ import yaml
 from support.grippers import gripper_from_dict
 from support.meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
 from support.sampled import INDEPENDENT, OPENING_M, NoisyMeter
-from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, box_model, nominal_cam_T_grip, plain_scenario
 from support.watched import reference_of, watched
 
 from gripmon.cli import main
@@ -26,14 +26,6 @@ from gripmon.track.edges import MeasurementSettings
 def forecast(lens: LensSettings = PAPER_LENS, **settings: object) -> AccuracyForecast:
     known = MonitorSettings(**{"floor_m": 0.0, "floor_rad": 0.0, "corners": INDEPENDENT, **settings})  # type: ignore[arg-type]
     return forecast_accuracy(make_camera(lens), box_gripper(), known, reference_of(nominal_cam_T_grip()), OPENING_M)
-
-
-def box_model() -> dict[str, Any]:
-    """The box fingers without bevels, as a parsed gripper file."""
-    model: dict[str, Any] = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    return model
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
