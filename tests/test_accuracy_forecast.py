@@ -12,7 +12,7 @@ import yaml
 from support.grippers import gripper_from_dict
 from support.meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
 from support.sampled import INDEPENDENT, OPENING_M, NoisyMeter
-from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, box_model, nominal_cam_T_grip, plain_scenario
 from support.watched import watched
 
 from gripmon.cli import main
@@ -35,14 +35,6 @@ def lever_m(gripper: Gripper) -> float:
     """Root mean square distance of the corners from the TCP, by which a turn of one radian moves them."""
     corners_m = gripper.points_grip_m(OPENING_M)[gripper.landmarks]
     return float(np.sqrt((corners_m**2).sum(axis=1).mean()))
-
-
-def box_model() -> dict[str, Any]:
-    """The box fingers without bevels, as a parsed gripper file."""
-    model: dict[str, Any] = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    return model
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])

@@ -17,7 +17,7 @@ from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image
 from gripmon.monitor import MonitorSettings
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, Simulator, paper_rig
 from gripmon.simulate.scenario import Background, BentFinger, Cover, Defocus, ObjectLook, Prop, Tilt
 from gripmon.track.edges import FingertipMeter
 
@@ -29,7 +29,7 @@ CAMERA = make_camera(PAPER_LENS)
 
 def simulated(**changes: Any) -> Simulator:
     scenario = Scenario(name="causes", fps=FPS, duration_s=1.0, **changes)
-    return Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, 3)
+    return paper_rig(box_gripper()).simulator(scenario, 3)
 
 
 class Watching:
@@ -126,7 +126,7 @@ def test_the_report_is_named_when_it_is_wrong(wrong_m: float):
 def test_the_lens_is_named_when_its_focal_length_or_focus_changed():
     scene = simulated(background=PLAIN)
     zoomed = msgspec.structs.replace(PAPER_LENS, fx_px=972.0, fy_px=972.0)
-    later = Simulator(make_camera(zoomed), box_gripper(), nominal_cam_T_grip(), scene.scenario, 3)
+    later = paper_rig(box_gripper(), lens=zoomed).simulator(scene.scenario, 3)
     explanation, _ = explained(scene, later)
     assert explanation.probable.cause is Cause.LENS
     assert "+1.0" in explanation.text
@@ -165,7 +165,7 @@ def test_one_covered_finger_is_not_called_bent():
 def test_images_that_come_again_do_not_tell_that_the_jaw_is_elsewhere():
     """The robot goes on reporting openings that the old images don't show."""
     scenario = Scenario(name="frozen", fps=FPS, duration_s=1.0)
-    scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, 3)
+    scene = paper_rig(box_gripper()).simulator(scenario, 3)
     frames = [scene.frame(index) for index in range(22)]
     monitor = new_monitor(MonitorSettings(jaw_sigma_m=0.0))
     told = [monitor.process(frame) for frame in frames]
@@ -184,7 +184,7 @@ def test_images_that_come_again_do_not_tell_that_the_jaw_is_elsewhere():
 def test_a_report_that_is_only_roughly_known_is_named_when_it_is_wrong():
     """What the images tell of its error is soon believed: neither the drift nor the edges show anything then."""
     scenario = Scenario(name="jaw", fps=FPS, duration_s=2.0, background=PLAIN)
-    scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, 3)
+    scene = paper_rig(box_gripper()).simulator(scenario, 3)
     monitor, rng = new_monitor(MonitorSettings(jaw_sigma_m=3e-5)), np.random.default_rng(5)
     told = []
     for index in range(40):
@@ -200,7 +200,7 @@ def test_a_knock_while_the_monitor_learns_what_is_normal_is_still_the_cameras(se
     """Frames from before and after it, taken together, look like a bent finger, and like nothing else."""
     knock = Tilt(start_s=9.5 / FPS, time_s=0.0, tcp_shift_m=(1e-3, 2e-4), translation_m=(-1e-3, 0.0, 2e-4))
     scenario = Scenario(name="early", fps=FPS, duration_s=1.5, mount=(knock,))
-    scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, seed)
+    scene = paper_rig(box_gripper()).simulator(scenario, seed)
     monitor = new_monitor()
     told = [monitor.process(scene.frame(index)) for index in range(44)]
     assert {alert.cause for record in told for alert in record.alerts} - {Cause.UNKNOWN} == {Cause.CAMERA_MOUNT}

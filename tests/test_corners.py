@@ -26,7 +26,7 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import CornerFault
-from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate import Simulator, make_scenario, paper_rig
 from gripmon.simulate.scenario import BentFinger, JawScript
 from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
 from gripmon.track.edges.settings import CornerSettings, RobustFitSettings
@@ -166,7 +166,7 @@ def test_corners_out_of_the_image_are_outside():
 
 def cube_seen(pose: np.ndarray, settings: MeasurementSettings | None = None) -> tuple[Measurement, Simulator, Gripper]:
     gripper = gripper_from_dict(cube_model(0.03))
-    scene = Simulator(make_camera(PAPER_LENS), gripper, pose, PLAIN, 1)
+    scene = paper_rig(gripper, pose).simulator(PLAIN, 1)
     return meter(gripper, settings=settings).measure(scene.render(0), pose, 0.0, 0.9, NARROW), scene, gripper
 
 

@@ -27,7 +27,7 @@ from gripmon.model.gripper import Gripper, GripperError
 from gripmon.model.gripper.model import contents_of
 from gripmon.model.records import Cause, Frame, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
+from gripmon.simulate import FrameTruth, Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import Bump, ObjectLook, Prop
 from gripmon.track.edges import FingerEnds
 from gripmon.track.edges.prediction import lay_out, predict
@@ -53,7 +53,7 @@ def rounded(radius_m: float) -> tuple[Gripper, Gripper]:
 def seen(radius_m: float, scenario: Scenario) -> tuple[Watched, Monitor]:
     model, solids = rounded(radius_m)
     pose = nominal_cam_T_grip()
-    simulator = Simulator(make_camera(PAPER_LENS), solids, pose, scenario, 5)
+    simulator = paper_rig(solids, pose).simulator(scenario, 5)
     frames: tuple[Frame, ...] = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     truths: tuple[FrameTruth, ...] = tuple(simulator.truth(i) for i in range(simulator.frame_count))
     monitor = Monitor(make_camera(PAPER_LENS), model, MonitorSettings(), reference_of(pose))
@@ -213,7 +213,7 @@ def test_fingers_end_where_their_sides_turn_into_curves():
 def test_a_side_of_which_nothing_is_seen_is_not_seen_to_turn():
     """However well the curve is seen: half as much as on the rest of the side would be none, too."""
     model, solids = rounded(0.004)
-    image = Simulator(make_camera(PAPER_LENS), solids, nominal_cam_T_grip(), plain_scenario(), 1).render(0)
+    image = paper_rig(solids).simulator(plain_scenario(), 1).render(0)
     found = measure(image, using=meter(model), jaw_opening_m=model.jaw_nominal_m)
     ends = FingerEnds(model, EdgeSettings())
     assert ends.seen(image, found).seen.tolist() == [2, 2]
@@ -283,7 +283,7 @@ def test_tips_that_are_nearly_straight_prove_nothing_where_a_bar_goes_on_beside_
     for level_dn in (30.0, 120.0):
         look = ObjectLook(pattern="plain", level_dn=level_dn)
         bar = Prop(size_m=(0.2, 0.01, size_z_m), centre_m=(0.0, -0.02, z_m), look=look)
-        image = Simulator(make_camera(PAPER_LENS), solids, nominal, plain_scenario(props=(bar,)), 1).render(0)
+        image = paper_rig(solids, nominal).simulator(plain_scenario(props=(bar,)), 1).render(0)
         for slide_m in np.linspace(-0.03, 0.012, 29).tolist():
             start = nominal.copy()
             start[:3, 3] += slide_m * start[:3, 2]
@@ -305,7 +305,7 @@ def test_the_overlay_and_the_recording_show_the_curve(tmp_path: Path, capsys: py
     """From files, as a user has them: `check`, then `replay` with a recording."""
     model, solids = rounded(0.004)
     pose = nominal_cam_T_grip()
-    simulator = Simulator(make_camera(PAPER_LENS), solids, pose, make_scenario("clutter", duration_s=0.5, fps=FPS), 5)
+    simulator = paper_rig(solids, pose).simulator(make_scenario("clutter", duration_s=0.5, fps=FPS), 5)
     (tmp_path / "images").mkdir()
     for i in range(simulator.frame_count):
         cv2.imwrite(str(tmp_path / "images" / f"{i:03d}.png"), simulator.frame(i).image)

@@ -11,12 +11,11 @@ import pytest
 from support.box_models import cube_model, two_fingers_model
 from support.grippers import gripper_from_dict
 from support.meters import NARROW, box_gripper, measure, meter, picture
-from support.simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.daemon.config import read_gripper
-from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.simulate import Scenario, Simulator, make_scenario
+from gripmon.simulate import Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement, MeasurementSettings
 from gripmon.track.edges.roles import along_fingers
@@ -228,7 +227,7 @@ def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Grippe
         pose = about @ pose
     middle = cube.points_grip_m().mean(axis=0)
     pose[:3, 3] = np.array([0.0, 0.0, 0.35]) - pose[:3, :3] @ middle
-    image = Simulator(make_camera(PAPER_LENS), cube, pose, PLAIN, 1).render(0)
+    image = paper_rig(cube, pose).simulator(PLAIN, 1).render(0)
     using = meter(cube)
     found = using.measure(image, pose, cube.jaw_nominal_m, 0.9, NARROW)
     ends = using.ends(image, found)

@@ -18,12 +18,11 @@ from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.running import run
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.model.geometry import from_record
 from gripmon.model.outputs import Event, Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor
 from gripmon.record.recorder import Recorder
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario
 
 COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames
 MOST_FILES, MOST_FUNCTIONS, MOST_CALLS = 53, 283, 457
@@ -73,8 +72,7 @@ class Counted(Output):
 def test_the_way_of_a_frame_gets_no_longer():
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     settings = config.settings
-    start = from_record(config.reference.cam_T_grip)
-    simulator = Simulator(config.camera, config.gripper, start, Scenario(name="way", duration_s=2.0, fps=60.0), seed=1)
+    simulator = config.scene.simulator(Scenario(name="way", duration_s=2.0, fps=60.0), 1)
     link = Link(PublishSettings(listen=(free_endpoint(),)))
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
     counted = Counted([simulator.frame(k) for k in range(COUNTED.stop)], publisher)

@@ -38,7 +38,7 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, ReferenceRecord, Transform, ValidBy, Verdict
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, Creep, FingerLook, FingerMark, Light, Sensor
 from gripmon.teach.fingers import UnclearPartsError
 from gripmon.teach.from_images import GripperFromImages, gripper_from_images
@@ -276,7 +276,7 @@ def test_a_model_made_so_is_tracked_as_exactly_as_the_true_one(box: tuple) -> No
     creep = Creep(start_s=0.5, time_s=0.8, tcp_shift_m=(0.0012, 0.0005))
     scenario = Scenario(name="x", duration_s=4.0, fps=15.0, mount=(creep,), background=Background(kind="printed"))
     truth = read_gripper(BOX_FINGERS)
-    simulator = Simulator(CAMERA, truth, nominal_cam_T_grip(), scenario, 77)
+    simulator = paper_rig(truth).simulator(scenario, 77)
     shown, truths = [simulator.frame(k) for k in range(60)], [simulator.truth(k) for k in range(60)]
     standing = [Frame(f.seq, f.stamp_ns, f.image, None, f.name) for f in shown]
     exact = errors_of(truth, truths[0].cam_T_grip, np.diag([1e-8] * 3 + [1e-6] * 3), shown, truths)
@@ -295,7 +295,7 @@ def test_how_well_the_size_is_known_is_in_every_bound(box: tuple) -> None:
     found = made_of(images[::2], PAPER_LENS, distance_m=(DEPTH_M + sigma_m, sigma_m))
     assert found.gripper.model.scale_sigma == pytest.approx(sigma_m / (DEPTH_M + sigma_m), rel=0.05)
     scenario = Scenario(name="x", duration_s=2.0, fps=15.0, background=Background(kind="printed"))
-    simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
+    simulator = paper_rig(read_gripper(BOX_FINGERS)).simulator(scenario, 77)
     reference = reference_of(found.cam_T_grip, found.covariance)
     for limit_m, verdict in ((1e-3, Verdict.SUSPECT), (2e-2, Verdict.VALID)):
         settings = MonitorSettings(policy=PolicySettings(alert_limit_m=limit_m))
@@ -318,7 +318,7 @@ def test_without_any_length_motion_is_measured_in_units_of_the_distance(box: tup
     assert any("size is unknown" in note and "valid_by: reference" in note for note in found.notes)
     creep = Creep(start_s=1.2, time_s=0.6, tcp_shift_m=(0.0008, 0.0004), translation_m=(0.0, 0.0, 0.0004))
     scenario = Scenario(name="x", duration_s=3.0, fps=10.0, mount=(creep,), background=Background(kind="printed"))
-    simulator = Simulator(CAMERA, read_gripper(BOX_FINGERS), nominal_cam_T_grip(), scenario, 77)
+    simulator = paper_rig(read_gripper(BOX_FINGERS)).simulator(scenario, 77)
     settings = MonitorSettings(policy=PolicySettings(valid_by=ValidBy.REFERENCE))
     monitor = Monitor(CAMERA, found.gripper, settings, reference_of(found.cam_T_grip, found.covariance))
 
@@ -384,7 +384,7 @@ def test_round_tips_become_curves_between_straight_sides_and_are_seen_as_ends(ra
     assert np.quantile(_curves_beside_px(found, coverage(moving_robot(311, gripper=solids))), 0.95) < 0.25
     creep = Creep(start_s=0.5, time_s=0.8, tcp_shift_m=(0.0012, 0.0005))
     scenario = Scenario(name="x", duration_s=4.0, fps=15.0, mount=(creep,), background=Background(kind="printed"))
-    simulator = Simulator(CAMERA, solids, nominal_cam_T_grip(), scenario, 77)
+    simulator = paper_rig(solids).simulator(scenario, 77)
     shown, truths = [simulator.frame(k) for k in range(60)], [simulator.truth(k) for k in range(60)]
     standing = [Frame(f.seq, f.stamp_ns, f.image, None, f.name) for f in shown]
     share, misleading, errors = errors_of(gripper, found.cam_T_grip, found.covariance, standing, truths)

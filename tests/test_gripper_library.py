@@ -18,7 +18,7 @@ from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Origin
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, JawScript
 
 GRIPPERS = Path(__file__).resolve().parent.parent / "configs" / "grippers"
@@ -68,7 +68,7 @@ def test_a_library_gripper_is_tracked(name: str, bevel_m: float):
     middle = gripper.jaw_nominal_m
     jaw = JawScript(knots=((0.0, middle), (1.0, middle + 0.004))) if gripper.has_jaw else JawScript()
     scenario = Scenario(name="library", duration_s=2.0, fps=30.0, jaw=jaw, background=Background(kind="speckle"))
-    simulator = Simulator(camera, drawn(gripper, bevel_m), pose, scenario, 1)
+    simulator = paper_rig(drawn(gripper, bevel_m), pose).simulator(scenario, 1)
     monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(pose))
     errors = []
     for k in range(simulator.frame_count):

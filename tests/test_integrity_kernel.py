@@ -9,10 +9,9 @@ import pytest
 from support.by_numpy import integrity as by_numpy
 
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.model.geometry import from_record
 from gripmon.model.records import FrameRecord
 from gripmon.monitor import Monitor
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
 from gripmon.track.integrity import Doubts, Separation, kernel, separation
 from gripmon.track.integrity.separation import QUANTILES, Tails
@@ -259,10 +258,9 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
     """Of the demo's camera over half a second, with a knock in the middle."""
     monkeypatch.setattr(separation, "kernel", by)
     config = load_config(builtin_config("demo.yaml"), check_source=False)
-    start = from_record(config.reference.cam_T_grip)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))
-    simulator = Simulator(config.camera, config.gripper, start, scenario, seed=seed)
+    simulator = config.scene.simulator(scenario, seed)
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
     return [monitor.process(simulator.frame(k)) for k in range(30)]
 

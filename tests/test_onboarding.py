@@ -33,7 +33,7 @@ from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.records import Image
 from gripmon.model.targets import CircleGrid, Target, TargetError
-from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate import make_scenario, paper_rig
 from gripmon.simulate.background import _TILE_PX
 from gripmon.teach.hand_eye import HandEyeOnPlate, KnownGripper, UnknownGripper, calibrate_plane
 from gripmon.teach.outline_edges import measure_outlines
@@ -113,7 +113,7 @@ def test_a_strong_lens_bends_edges_and_they_are_still_lines():
 def test_the_simulators_parked_gripper():
     """Another renderer, a bevel and texture on the fingers, no rough corners but a rough calibration."""
     camera, true, gripper = make_camera(PAPER_LENS), nominal_cam_T_grip(), read_gripper(BOX_FINGERS)
-    simulator = Simulator(camera, gripper, true, make_scenario("series1"), 5)
+    simulator = paper_rig(gripper, true).simulator(make_scenario("series1"), 5)
     period_m = _TILE_PX * float(true[2, 3]) / camera.fx_px
     plate = CircleGrid(60, 60, period_m / round(period_m / 8e-3), 0.004)  # whole discs in a tile
     for index in (0, 2, 4):

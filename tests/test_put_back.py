@@ -30,7 +30,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.mount import moves, summary
 from gripmon.model.records import CommandName, CommandReply, FrameRecord, Mount, Origin, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 
 LIMITS = 1e-3, math.radians(2.0)
 
@@ -148,7 +148,7 @@ def test_it_is_put_back_to_where_a_person_had_it_not_to_where_a_knock_left_it():
 
 def seen(monitor: Monitor, eye: Eye, clock: itertools.count[int], frames: int = 3) -> FrameRecord:
     """What the monitor says of pictures of a simulated gripper from there."""
-    scene = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), eye.cam_T_grip, Scenario(name="static"), 1)
+    scene = paper_rig(box_gripper(sharp=False), eye.cam_T_grip).simulator(Scenario(name="static"), 1)
     for _ in range(frames):
         seq = next(clock)
         record = monitor.process(scene.frame(seq))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-import yaml
 from support.grippers import gripper_from_dict
 from support.meters import (
     EVERYWHERE,
@@ -19,7 +18,7 @@ from support.meters import (
     picture,
     simulated,
 )
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import PAPER_LENS, box_model, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
 from gripmon.simulate import make_scenario
@@ -128,10 +127,8 @@ def test_the_votes_know_that_what_is_nearer_is_shifted_by_more(shift_m: tuple[fl
 
 def test_edges_that_never_show_in_place_are_not_asked_for_elsewhere():
     """Without faces a file doesn't say which of its edges the fingers hide themselves."""
-    model = yaml.safe_load(BOX_FINGERS.read_text())
+    model = box_model()
     del model["faces"]
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
     image, true = picture(make_scenario("static"), 0, 3), nominal_cam_T_grip()
     using = meter(gripper_from_dict(model))
     here = measure(image, using=using)

@@ -21,7 +21,7 @@ from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
 from gripmon.monitor.ends_told import EndsTold
 from gripmon.monitor.lighting import Lighting
 from gripmon.monitor.shadow import Look, Shadow, _alike, _texture
-from gripmon.simulate import Simulator
+from gripmon.simulate import paper_rig
 from gripmon.simulate.scenario import Scenario
 from gripmon.track.edges import FingerEndsSeen
 from gripmon.track.edges.prediction import EdgeLayout
@@ -57,7 +57,7 @@ def seen_in(image: np.ndarray, pose: np.ndarray, opening_m: float, camera: objec
 
 
 def picture(pose: np.ndarray, scenario: Scenario | None = None) -> tuple[np.ndarray, float]:
-    simulator = Simulator(make_camera(PAPER_LENS), sharp_gripper(), pose, scenario or plain_scenario(), 1)
+    simulator = paper_rig(sharp_gripper(), pose).simulator(scenario or plain_scenario(), 1)
     frame = simulator.frame(0)
     assert isinstance(frame.image, np.ndarray) and frame.jaw_opening_m is not None
     return frame.image, frame.jaw_opening_m

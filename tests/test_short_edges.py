@@ -15,7 +15,7 @@ from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Verdict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import Scenario, Simulator, make_scenario
+from gripmon.simulate import Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import prediction_kernel
 from gripmon.track.edges.prediction import BORDER_PX, ROWS, independent_part, lay_out
@@ -143,7 +143,7 @@ def test_tips_of_short_edges_are_measured_as_exactly_as_is_said(tip: str):
     camera, pose, nees, valid, frames = make_camera(PAPER_LENS), nominal_cam_T_grip(), [], 0, 0
     scenario = make_scenario("clutter", duration_s=0.4, fps=15.0)
     for seed in range(6):
-        simulator = Simulator(camera, solids, pose, scenario, seed)
+        simulator = paper_rig(solids, pose).simulator(scenario, seed)
         indices = range(simulator.frame_count)
         monitor = Monitor(camera, model, MonitorSettings(), reference_of(pose))
         seen = watch(
@@ -171,7 +171,7 @@ def test_what_shows_along_fingers_is_learnt_where_their_sides_are_made_of_severa
     along = along_fingers(model)[1]
     first = [e for e in np.flatnonzero(along) if model.edge_ids[e] in ("left_edge1", "left_edge2")]
     assert first, "facets that run along the finger"
-    simulator = Simulator(make_camera(PAPER_LENS), solids, nominal_cam_T_grip(), Scenario(fps=2.0, duration_s=4.0), 1)
+    simulator = paper_rig(solids).simulator(Scenario(fps=2.0, duration_s=4.0), 1)
     strips = FingerStrips(make_camera(PAPER_LENS), model, along)
     for i in range(FIRST_FRAMES):
         truth = simulator.truth(i)
@@ -215,7 +215,7 @@ def test_a_shadow_parallel_to_short_edges_is_no_end_of_the_fingers(
 def proven_elsewhere(model: Gripper, solids: Gripper, scenario: Scenario, slides_m: list[float]) -> list[float]:
     """From which starts the ends of the fingers are surely seen more than 0.2 mm from where they are."""
     nominal, using = nominal_cam_T_grip(), meter(model)
-    image = Simulator(make_camera(PAPER_LENS), solids, nominal, scenario, 1).render(0)
+    image = paper_rig(solids, nominal).simulator(scenario, 1).render(0)
     out = []
     for slide_m in slides_m:
         found = measure(image, slid(slide_m), using=using, jaw_opening_m=model.jaw_nominal_m)

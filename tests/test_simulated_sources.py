@@ -19,7 +19,6 @@ from support.counting_maker import SHAPE, CountingMaker
 
 from gripmon.daemon.config import read_gripper
 from gripmon.io.sources import (
-    SimulatedScene,
     SimulatedSettings,
     SourceError,
     SourceSettings,
@@ -32,7 +31,7 @@ from gripmon.io.sources.simulated import SimulatedSequence
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.records import Frame
-from gripmon.simulate import make_scenario
+from gripmon.simulate import Rig, make_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,10 +56,10 @@ def cameras() -> Iterator[list[SimulatedCamera]]:
 
 
 @pytest.fixture(scope="module")
-def scene() -> SimulatedScene:
+def scene() -> Rig:
     lens = PaperLens(width_px=192, height_px=144, fx_px=240.5, fy_px=240.5, cx_px=95.5, cy_px=71.5, kappa_per_px2=3e-6)
     tilted = make_transform(exp_rotation(np.array([0.55, 0.0, 0.0])), np.array([0.0, 0.0, 0.12]))
-    return SimulatedScene(make_camera(lens), read_gripper(ROOT / "configs/grippers/two_box_fingers.yaml"), tilted)
+    return Rig(make_camera(lens), read_gripper(ROOT / "configs/grippers/two_box_fingers.yaml"), tilted)
 
 
 def frames_of(camera: SimulatedCamera, count: int) -> list[Frame]:
@@ -268,7 +267,7 @@ def test_renderers_end_when_their_parent_is_killed(started: tuple[subprocess.Pop
 # --- the simulator behind it ---
 
 
-def test_the_sequence_is_the_scenario_frame_by_frame(scene: SimulatedScene):
+def test_the_sequence_is_the_scenario_frame_by_frame(scene: Rig):
     settings = SimulatedSettings(scenario="bump", duration_s=0.5, fps=10.0, seed=3, realtime=False)
     source = open_source(settings, scene=scene)
     assert isinstance(source, SimulatedSequence) and not source.live and len(source) == 5
@@ -283,7 +282,7 @@ def test_the_sequence_is_the_scenario_frame_by_frame(scene: SimulatedScene):
     source.close()
 
 
-def test_a_scenario_from_a_file(scene: SimulatedScene, tmp_path: Path):
+def test_a_scenario_from_a_file(scene: Rig, tmp_path: Path):
     scenario = make_scenario("creep", duration_s=1.0, fps=20.0)
     (tmp_path / "mine.yaml").write_bytes(msgspec.yaml.encode(scenario))
     simulator = make_simulator(SimulatedSettings(scenario="mine.yaml"), scene, tmp_path)
@@ -302,7 +301,7 @@ def test_a_scenario_from_a_file(scene: SimulatedScene, tmp_path: Path):
     ],
 )
 def test_scenarios_that_can_not_be_are_refused_in_one_line(
-    scene: SimulatedScene, tmp_path: Path, settings: SimulatedSettings, complaint: str
+    scene: Rig, tmp_path: Path, settings: SimulatedSettings, complaint: str
 ):
     (tmp_path / "typo.yaml").write_text("name: x\nfoo: 3\n")
     (tmp_path / "misfit.yaml").write_text("bent_fingers: [{finger: thumb, tip_shift_m: [0.001, 0, 0]}]\n")

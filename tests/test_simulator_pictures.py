@@ -342,7 +342,7 @@ def test_every_scenario_can_be_drawn_at_its_defaults(name: str):
     """Frame 77 of grasp has a fingertip that touches the image with its blur alone."""
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     scenario = make_scenario(name, finger=config.gripper.finger_ids[0])
-    drawn = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, 0)
+    drawn = config.scene.simulator(scenario, 0)
     count = drawn.frame_count
     for index in sorted({count // 2, min(77, count - 1), count - 1}):
         assert drawn.render(index).std() > 1.0

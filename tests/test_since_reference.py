@@ -35,7 +35,7 @@ from gripmon.monitor import Monitor, MonitorSettings, trust
 from gripmon.monitor.common import CommonError
 from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, Opened
 from gripmon.monitor.tracker import Tracker
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.integrity import Separation
@@ -337,7 +337,7 @@ def test_a_restart_goes_on_with_it_and_sees_a_knock_in_between():
     pose, camera, gripper = nominal_cam_T_grip(), make_camera(PAPER_LENS), box_gripper(sharp=False)
     settings = MonitorSettings(policy=BY_REFERENCE)
     monitor = Monitor(camera, gripper, settings, reference_at(pose))
-    simulator = Simulator(camera, gripper, pose, scene(24, mount=(KNOCK,)), 2)
+    simulator = paper_rig(gripper, pose).simulator(scene(24, mount=(KNOCK,)), 2)
     before = [monitor.process(simulator.frame(i)) for i in range(KNOCKED - 1)]
     assert monitor.state().at_reference is msgspec.UNSET  # fewer than thirty proved it
     at = monitor._trust.since
@@ -371,13 +371,13 @@ def test_a_knock_while_it_was_off_is_seen_in_the_motion_though_the_first_frames_
     pose, camera, gripper = nominal_cam_T_grip(), make_camera(PAPER_LENS), box_gripper(sharp=False)
     settings = MonitorSettings(policy=BY_REFERENCE)
     monitor = Monitor(camera, gripper, settings, reference_at(pose))
-    before = Simulator(camera, gripper, pose, scene(FIRST_FRAMES + 10), 2)
+    before = paper_rig(gripper, pose).simulator(scene(FIRST_FRAMES + 10), 2)
     for index in range(FIRST_FRAMES + 8):
         told = monitor.process(before.frame(index)).since_reference
         monitor.run_pending()
     again, knocked = restarted(monitor.state(), settings), pose.copy()
     knocked[:3, 3] += KNOCK_M
-    ends, after, records = Tracker.ends, Simulator(camera, gripper, knocked, scene(20), 3), []
+    ends, after, records = Tracker.ends, paper_rig(gripper, knocked).simulator(scene(20), 3), []
 
     def no_ends(tracker: Tracker, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
         none = np.zeros(2, dtype=np.intp)
@@ -403,7 +403,7 @@ def test_a_knock_is_a_change_for_the_state_file_once(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(trust, "PROOF_EVERY_FRAMES", 1)
     pose, camera, gripper = nominal_cam_T_grip(), make_camera(PAPER_LENS), box_gripper(sharp=False)
     monitor = Monitor(camera, gripper, MonitorSettings(policy=BY_REFERENCE), reference_at(pose))
-    simulator, changes = Simulator(camera, gripper, pose, scene(40, mount=(KNOCK,)), 2), []
+    simulator, changes = paper_rig(gripper, pose).simulator(scene(40, mount=(KNOCK,)), 2), []
     for index in range(36):
         monitor.process(simulator.frame(index))
         monitor.run_pending()

@@ -16,7 +16,7 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.monitor import MonitorSettings, Tracker
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, FingerLook
 from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.mounts import Mount, field_of_view_rad, towards, try_mount, with_focal
@@ -125,7 +125,7 @@ def scatter(mount: Mount) -> np.ndarray:
     camera, gripper = make_camera(PAPER_LENS), read_gripper(BOX_FINGERS)
     cam_T_grip = pose(mount)
     scenario = Scenario(duration_s=20.0, fps=4.0, background=TABLE, fingers=FingerLook(carriers=False))
-    simulator = Simulator(camera, gripper, cam_T_grip, scenario, 3)
+    simulator = paper_rig(gripper, cam_T_grip).simulator(scenario, 3)
     tracker = Tracker(camera, gripper, MonitorSettings(jaw_sigma_m=0.0))
     errors = []
     for k in range(FRAMES):

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.changing_backgrounds import images_of, moving_robot
 from support.meters import moved
-from support.simulated import BOX_FINGERS, nominal_cam_T_grip
+from support.simulated import BOX_FINGERS, box_model, nominal_cam_T_grip
 from support.taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.cli import main
@@ -41,10 +41,7 @@ LEVELS = (120.0, 180.0, 230.0)
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A configuration with sharp fingers, and images of bevelled ones: three to teach from, five of a moved camera."""
     folder = tmp_path_factory.mktemp("rig")
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    (folder / "gripper.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
+    (folder / "gripper.yaml").write_text(yaml.safe_dump(box_model(), sort_keys=False))
     values = yaml.safe_load(builtin_config("demo.yaml").read_text())
     transform = msgspec.to_builtins(to_record(POSE))
     values["reference"]["cam_T_grip"] = {key: list(value) for key, value in transform.items()}

@@ -27,7 +27,7 @@ from gripmon.model.geometry import from_record, perturb, perturbation_between, t
 from gripmon.model.provenance import Provenance
 from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings
-from gripmon.simulate import Simulator
+from gripmon.simulate import paper_rig
 from gripmon.simulate.scenario import JawScript, Sensor
 from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.corner_pose import PoseRefused, place, pose_from_corners, usual_view
@@ -189,7 +189,7 @@ def test_the_pose_is_as_good_as_its_covariance_says():
         sensor = msgspec.structs.replace(IDEAL_SENSOR, read_noise_dn=1.5)
         assert isinstance(sensor, Sensor)
         scene = plain_scenario(jaw=JawScript(knots=((0.0, OPENING_M),)), sensor=sensor)
-        simulator = Simulator(make_camera(lens), gripper, pose, scene, trial)
+        simulator = paper_rig(gripper, pose, lens=lens).simulator(scene, trial)
         exact = MonitorSettings(jaw_sigma_m=sigma_m, model_sigma_m=0.0)
         setup = Setup(make_camera(PAPER_LENS), gripper, exact, None, error)
         points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points]

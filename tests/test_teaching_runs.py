@@ -18,7 +18,7 @@ from gripmon.judge.drift import DriftSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate import make_scenario, paper_rig
 from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
 from gripmon.teach.measure import teach
 from gripmon.teach.views import TeachingImage
@@ -35,7 +35,7 @@ def test_a_recalibrated_monitor_keeps_what_was_taught():
     bump = make_scenario("bump", duration_s=3.0, fps=20.0)
     even = {"background": table(180.0), "fingers": FingerLook(texture=0.0, carriers=False), "sensor": Sensor()}
     sections = {name: even.get(name, getattr(bump, name)) for name in Scenario.__struct_fields__}
-    simulator = Simulator(CAMERA, bevelled(BEVEL_M), POSE, Scenario(**sections), 1)
+    simulator = paper_rig(bevelled(BEVEL_M), POSE).simulator(Scenario(**sections), 1)
     taught = arrays(taught_from(image_of(BEVEL_M)))
     settings = MonitorSettings(
         drift=DriftSettings(frames_per_s=20.0), recalibration=RecalibrationSettings(sure_sigma_m=2e-4)

@@ -18,7 +18,7 @@ from gripmon.model.gripper import EdgeModel, FaceModel, FingerModel, Gripper, Gr
 from gripmon.model.records import Array, ReferenceRecord, ValidBy
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, Bump, FingerLook
 from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, place
 from gripmon.teach.result import GripperResult
@@ -255,7 +255,7 @@ def knocked(true_T: Array, file: Gripper, knock: Bump = SHIFT, *, still: bool = 
         fingers=FingerLook(carriers=False),
     )
     camera = make_camera(PAPER_LENS)
-    simulator = Simulator(camera, solid_plates(), true_T, scenario, 3)
+    simulator = paper_rig(solid_plates(), true_T).simulator(scenario, 3)
     reference = reference_of(FILE_T)
     reference = msgspec.structs.replace(reference, covariance=tuple(np.diag([1e-6] * 3 + [1e-2] * 3).ravel().tolist()))
     policy = PolicySettings(valid_by=ValidBy.REFERENCE, alert_limit_m=0.02, alert_limit_rad=0.35)

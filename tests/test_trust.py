@@ -35,7 +35,7 @@ from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.ends import MISREAD_PROBABILITY
 from gripmon.monitor.standing import Trust
 from gripmon.monitor.trust import Integrity
-from gripmon.simulate import FrameTruth, Scenario, Simulator
+from gripmon.simulate import FrameTruth, Scenario, Simulator, paper_rig
 from gripmon.simulate.scenario import (
     Background,
     BentFinger,
@@ -74,7 +74,7 @@ def frames_of(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, 
 
 
 def simulated(scenario: Scenario) -> Simulator:
-    return Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
+    return paper_rig(box_gripper(sharp=False)).simulator(scenario, 1)
 
 
 @lru_cache(maxsize=1)
@@ -238,7 +238,7 @@ def lined_fingers_knocked() -> Simulator:
         fingers=fingers,
         sensor=Sensor(psf_sigma_px=0.522448, exposure_time_s=0.0036005),
     )
-    return Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), cam_T_grip, scenario, 322947636)
+    return paper_rig(box_gripper(sharp=False), cam_T_grip).simulator(scenario, 322947636)
 
 
 def test_lines_round_both_fingers_are_no_ends_of_them_after_a_knock():

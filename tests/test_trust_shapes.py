@@ -25,7 +25,7 @@ from gripmon.monitor.bounds import SIGMA_INFLATION
 from gripmon.monitor.ends import MISREAD_PROBABILITY
 from gripmon.monitor.since import AtReferences
 from gripmon.monitor.weigher import Weigher
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, BentFinger, Bump, FingerLook, Sensor
 from gripmon.track.edges import FingerEndsSeen, Measurement, edges_at_ends, inner_edges, sides
 from gripmon.track.edges.roles import along_fingers
@@ -68,7 +68,7 @@ def knocked_tapered_fingers() -> tuple[Monitor, Measurement]:
     x, y, z = (-3e-3 * pose[:3, 2]).tolist()
     knock = Bump(at_s=(KNOCK - 0.6) / FPS, ring_fraction=0.0, translation_m=(x, y, z))
     scenario = Scenario(name="tapered", fps=FPS, duration_s=1.0, mount=(knock,))
-    simulator = Simulator(camera, gripper, pose, scenario, 1)
+    simulator = paper_rig(gripper, pose).simulator(scenario, 1)
     for k in range(KNOCK):
         monitor.process(simulator.frame(k))
     measurement = Tracker(camera, gripper, settings).measure(
@@ -176,7 +176,7 @@ def bevelled_stills(bevel_m: float, known_m: float) -> Watched:
     gripper, shown = (gripper_from_dict(box_fingers(width_m)) for width_m in (known_m, bevel_m))
     rough = tuple(np.diag(np.square([1e-3] * 3 + [1e-2] * 3)).ravel().tolist())
     reference = msgspec.structs.replace(reference_of(pose), covariance=rough)
-    simulator = Simulator(camera, shown, pose, Scenario(name="bevels", fps=FPS, duration_s=0.6), 1)
+    simulator = paper_rig(shown, pose).simulator(Scenario(name="bevels", fps=FPS, duration_s=0.6), 1)
     frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     truths = tuple(simulator.truth(i) for i in range(simulator.frame_count))
     return watch(frames, truths, Monitor(camera, gripper, MonitorSettings(), reference))
@@ -225,7 +225,7 @@ def test_grey_levels_of_a_colour_camera_are_read_as_light(response: Literal["lin
     scenario = Scenario(
         name="srgb", fps=FPS, duration_s=0.8, fingers=look, background=background, sensor=Sensor(psf_sigma_px=1.0)
     )
-    simulator = Simulator(camera, gripper, pose, scenario, 1)
+    simulator = paper_rig(gripper, pose).simulator(scenario, 1)
     edges = MonitorSettings().corners.edges
     corners = msgspec.structs.replace(
         MonitorSettings().corners, edges=msgspec.structs.replace(edges, response=response)
@@ -341,7 +341,7 @@ def knocked_round_tips(knock_m: float, radius_m: float, background: Background, 
     x, y, z = (knock_m * pose[:3, 2]).tolist()
     knock = Bump(at_s=(KNOCK - 0.5) / FPS, ring_fraction=0.0, translation_m=(x, y, z))
     scenario = Scenario(name="round", fps=FPS, duration_s=3.0, background=background, mount=(knock,))
-    simulator = Simulator(camera, rounded_solids(0.012, radius_m), pose, scenario, 1)
+    simulator = paper_rig(rounded_solids(0.012, radius_m), pose).simulator(scenario, 1)
     monitor = Monitor(camera, rounded_model(0.012, radius_m), settings, reference_of(pose))
     frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     return watch(frames, tuple(simulator.truth(i) for i in range(simulator.frame_count)), monitor)
@@ -386,7 +386,7 @@ def test_fingers_that_flex_alike_are_no_knock(flex_m: float, way: float):
         for finger, side in ((left, -1.0), (right, 1.0))
     )
     scenario = Scenario(fps=20.0, bent_fingers=bends, background=Background(kind="speckle"))
-    simulator = Simulator(camera, gripper, nominal_cam_T_grip(), scenario, seed=3)
+    simulator = paper_rig(gripper).simulator(scenario, 3)
     monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(nominal_cam_T_grip()))
     for index in range(45):
         record = monitor.process(simulator.frame(index))
@@ -403,7 +403,7 @@ def test_fingers_that_flex_alike_are_no_knock(flex_m: float, way: float):
 def test_of_a_lone_finger_that_may_have_slid_along_itself_no_look_is_learnt(away_m: float):
     """Found a millimetre along from its reference: that may be a mark's place, and only a person can say."""
     gripper, camera, pose = lone_finger(), make_camera(PAPER_LENS), nominal_cam_T_grip()
-    simulator = Simulator(camera, gripper, pose, Scenario(name="lone", fps=FPS, duration_s=1.0), 1)
+    simulator = paper_rig(gripper, pose).simulator(Scenario(name="lone", fps=FPS, duration_s=1.0), 1)
     reference_T = pose.copy()
     reference_T[:3, 3] += away_m * pose[:3, 2]
     monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(reference_T))

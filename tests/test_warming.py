@@ -207,9 +207,8 @@ def test_several_starts_at_once_compile_once_and_share_it(tmp_path: Path):
 KNOCKED = """
 import sys
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.model.geometry import from_record
 from gripmon.monitor import Monitor, warm_up
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
 
 def compiled():
@@ -218,7 +217,7 @@ def compiled():
 
 config = load_config(builtin_config("demo.yaml"), check_source=False)
 scenario = Scenario(name="knock", duration_s=1.0, fps=60.0, mount=(Bump(at_s=0.25, translation_m=(0.0, 1e-3, 2e-3)),))
-simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)
+simulator = config.scene.simulator(scenario, seed=1)
 frames = [simulator.frame(k) for k in range(30)]
 warm_up()
 before = compiled()

@@ -16,6 +16,7 @@ from gripmon.io.sources import (
     FolderSettings,
     FullScale,
     OpenedSource,
+    SimulatedSettings,
     Source,
     SourceError,
     SourceSettings,
@@ -84,8 +85,9 @@ def open_configured(config: Config, link: Link | None = None) -> Source:
     """Start the configured source, on the network through ``link``.  Raises :class:`ConfigError` if it can't start."""
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
     keys = Keys(settings.robot, settings.camera_name)
+    scene = config.scene if isinstance(settings.source, SimulatedSettings) else None  # others don't need its packages
     try:
-        source = start(settings.source, config.directory, scene=config.scene, size_px=size_px, link=link, keys=keys)
+        source = start(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
     except SourceError as error:
         raise ConfigError(config.path, "", f"source.{error}") from None
     bit_depth = settings.monitor.bit_depth

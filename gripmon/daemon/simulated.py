@@ -33,7 +33,6 @@ from gripmon.record.viewer import free_port
 from gripmon.simulate import (
     CALIBRATION_KINDS,
     SCENARIO_NAMES,
-    Rig,
     Scenario,
     Simulator,
     image_count,
@@ -90,7 +89,7 @@ def simulate_images(
         return _calibration_images(str(scenario), out, config, seed, step)
     made = _scenario(scenario, config, duration_s, fps)
     with input_errors(str(scenario)):
-        simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, made, seed)
+        simulator = config.scene.simulator(made, seed)
     _make_empty(out)
     if scenario == "work":
         return SimulatedImages(out, None, write_sequence(simulator, out, step))
@@ -108,13 +107,9 @@ def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: f
         return load_scenario(path)
     if name not in SCENARIO_NAMES:
         raise InputError(f"simulate: there is no '{name}'; one of {', '.join((*SCENARIO_NAMES, *CALIBRATION_KINDS))}")
-    finger, opening_m = config.gripper.finger_ids[0], _rig(config).jaw_opening_m
+    finger, opening_m = config.gripper.finger_ids[0], config.scene.jaw_opening_m
     with input_errors("simulate"):
         return make_scenario(str(name), duration_s=duration_s, fps=fps, finger=finger, jaw_opening_m=opening_m)
-
-
-def _rig(config: Config) -> Rig:
-    return Rig(config.camera, config.gripper, config.cam_T_grip)
 
 
 def _calibration_images(
@@ -123,7 +118,7 @@ def _calibration_images(
     _make_empty(out)
     count, done = image_count(kind), itertools.count(1)
     with input_errors(f"simulate {kind}"):
-        write_calibration_images(kind, _rig(config), out, seed, lambda: step(next(done), count))
+        write_calibration_images(kind, config.scene, out, seed, lambda: step(next(done), count))
     return SimulatedImages(out, None, count)
 
 

@@ -11,7 +11,6 @@ import csv
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,9 @@ from gripmon.simulate.coverage import RayGrid
 from gripmon.simulate.disturbance import SensorModel
 from gripmon.simulate.laser import cluttered, paper_cell, pixels_of, poses_on_plane, spot_image
 from gripmon.simulate.plates import Plate, PlateBackdrop, facing
+from gripmon.simulate.rig import Rig
 from gripmon.simulate.scenario import JawScript, Scenario, Sensor
-from gripmon.simulate.sequence import PNG_COMPRESSION, Simulator
+from gripmon.simulate.sequence import PNG_COMPRESSION
 
 PLATE = CircleGrid(12, 10, 0.008, 0.004)
 """Mostly light, so that dark fingers stand out in front of it."""
@@ -54,23 +54,6 @@ _CAMERA_MOTION = np.array([2e-3, -1e-3, 1e-3, 0.002, 0.004, -0.003])
 """Motion of the second camera before the fresh spots (m, rad)."""
 
 Progress = Callable[[], None]
-
-
-@dataclass(frozen=True)
-class Rig:
-    """A wrist camera, its gripper, and the true ``cam_T_grip`` (4, 4)."""
-
-    camera: Camera
-    gripper: Gripper
-    cam_T_grip: Array
-
-    @property
-    def jaw_opening_m(self) -> float:
-        """Nearly fully open, so that the fingers are near the image's borders and leave the plate visible; nominal for
-        a gripper without a jaw.
-        """
-        low, high = self.gripper.jaw_min_m, self.gripper.jaw_max_m
-        return low + 5.0 / 6.0 * (high - low) if self.gripper.has_jaw else self.gripper.jaw_nominal_m
 
 
 def image_count(kind: str) -> int:
@@ -248,7 +231,7 @@ def _with_gripper(rig: Rig, plate: Plate, seed: int, number: int) -> Image:
     scenario = Scenario(name="plate", jaw=JawScript(knots=knots))
     backdrop = PlateBackdrop(plate, rig.camera.settings, scenario.sensor.psf_sigma_px)
     own = seed * 100 + number  # independent noise for each image
-    return Simulator(rig.camera, rig.gripper, rig.cam_T_grip, scenario, own, backdrop).render(0)
+    return rig.simulator(scenario, own, backdrop).render(0)
 
 
 def _without_gripper(camera: Camera, plate: Plate, seed: int, number: int) -> Image:

@@ -12,7 +12,7 @@ from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, Simulator, paper_rig
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Light, Sensor
 from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.straight_pieces import Chain
@@ -51,7 +51,7 @@ def moving_robot(
         jaw=JawScript(knots=() if opening_m is None else ((0.0, opening_m),)),
     )
     pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
-    return Simulator(CAMERA, gripper or read_gripper(BOX_FINGERS), pose, scenario, seed)
+    return paper_rig(gripper or read_gripper(BOX_FINGERS), pose).simulator(scenario, seed)
 
 
 def images_of(simulator: Simulator, count: int = 30) -> list[NDArray[np.uint8]]:
@@ -63,7 +63,7 @@ def images_of(simulator: Simulator, count: int = 30) -> list[NDArray[np.uint8]]:
 def _rendered(
     model: GripperModel, nominal_cam_T_grip: Array, scenario: Scenario, seed: int, count: int
 ) -> list[NDArray[np.uint8]]:
-    simulator = Simulator(CAMERA, Gripper(model), nominal_cam_T_grip, scenario, seed)
+    simulator = paper_rig(Gripper(model), nominal_cam_T_grip).simulator(scenario, seed)
     return [simulator.render(k) for k in range(count)]
 
 

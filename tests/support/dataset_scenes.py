@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.daemon.config import Config, builtin_config, load_config
-from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import perturb
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Bump
 from support.episode_files import Shots, write_lerobot, write_mcap
 
@@ -64,9 +64,8 @@ def episode(config: Config, number: int, mounting: int, *, moves: bool = False, 
         name="episode", duration_s=count / FPS, fps=float(FPS), mount=mount,
         start_ns=1_790_000_000_000_000_000 + number * 3_600_000_000_000,
     )  # fmt: skip
-    camera = make_camera(LENS)
     cam_T_grip = perturb(config.cam_T_grip, MOUNTINGS[mounting])
-    simulator = Simulator(camera, config.gripper, cam_T_grip, scenario, 100 * seed + number)
+    simulator = paper_rig(config.gripper, cam_T_grip, LENS).simulator(scenario, 100 * seed + number)
     frames = [simulator.frame(i) for i in range(simulator.frame_count)]
     shots = Shots(
         [frame.image for frame in frames], [frame.stamp_ns for frame in frames],

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import yaml
 
-from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, Simulator, paper_rig
 from gripmon.simulate.scenario import Background, Cover, Defocus, FingerLook, JawScript, Light, Sensor
 from support.grippers import gripper_from_dict
 from support.meters import moved
@@ -76,7 +76,7 @@ def simulator(truth: dict[str, Any], gripper: Gripper) -> Simulator:
     """The simulator of a golden image, from its text alone."""
     lens: LensSettings = msgspec.convert(truth["camera"], LensSettings)  # type: ignore[arg-type]
     scenario = msgspec.convert(truth["scenario"], Scenario)
-    return Simulator(make_camera(lens), gripper, np.array(truth["nominal_cam_T_grip"]), scenario, truth["seed"])
+    return paper_rig(gripper, np.array(truth["nominal_cam_T_grip"]), lens=lens).simulator(scenario, truth["seed"])
 
 
 def load(name: str) -> tuple[Image, dict[str, Any], Gripper]:

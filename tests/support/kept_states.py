@@ -13,7 +13,7 @@ from gripmon.judge.references import ReferenceBook
 from gripmon.judge.statefile import StateFile
 from gripmon.model.geometry import from_record
 from gripmon.model.records import MonitorState
-from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate import Rig, make_scenario
 
 DIFFERENT = 12
 """Pictures of one place: so many that one that comes again is not taken for a frozen camera's."""
@@ -27,7 +27,7 @@ def make_pictures(folder: Path, frames: int, *, knocked_every: int | None = None
     knocked_T = config.cam_T_grip.copy()
     knocked_T[0, 3] += 0.0035
     for place, cam_T_grip in enumerate((config.cam_T_grip, knocked_T)):
-        simulator = Simulator(config.camera, config.gripper, cam_T_grip, scenario, 1)
+        simulator = Rig(config.camera, config.gripper, cam_T_grip).simulator(scenario, 1)
         for i in range(DIFFERENT):
             image = simulator.frame(i).image
             assert image is not None and cv2.imwrite(str(folder / f"original{place}-{i}.bmp"), image)

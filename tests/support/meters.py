@@ -11,7 +11,7 @@ from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, FisheyeLens, LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, Simulator, paper_rig
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
@@ -82,7 +82,7 @@ def picture(scenario: Scenario, index: int = 0, seed: int = 1, lens: LensSetting
 
 @lru_cache(maxsize=4)
 def simulated(scenario: Scenario, seed: int = 1, lens: LensSettings = PAPER_LENS) -> Simulator:
-    return Simulator(make_camera(lens), box_gripper(), nominal_cam_T_grip(), scenario, seed)
+    return paper_rig(box_gripper(), lens=lens).simulator(scenario, seed)
 
 
 def corners_px(camera: Camera, gripper: Gripper, cam_T_grip: np.ndarray) -> np.ndarray:

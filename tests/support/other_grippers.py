@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from gripmon.io.sources.files import TIMESTAMPS_NAME
 from gripmon.model.geometry import to_record
 from gripmon.model.records import Array
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, Creep
 from support.changing_backgrounds import CAMERA, images_of, moving_robot
 from support.simulated import nominal_cam_T_grip
@@ -49,7 +49,7 @@ def rounded_tips(folder: Path) -> Array:
     scenario = Scenario(
         name="work", duration_s=FRAMES / FPS, fps=FPS, mount=(knock,), background=Background(kind="printed")
     )
-    simulator = Simulator(CAMERA, solids, nominal_cam_T_grip(), scenario, 77)
+    simulator = paper_rig(solids).simulator(scenario, 77)
     write_images(folder / "work", images_of(simulator, FRAMES))
     return np.array([simulator.truth(k).cam_T_grip for k in range(FRAMES)])
 

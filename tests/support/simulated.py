@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import yaml
 
 from gripmon.daemon.config import read_gripper
-from gripmon.model.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
-from gripmon.model.gripper import Gripper, GripperModel
-from gripmon.simulate import Scenario, Simulator
+from gripmon.model.camera import BrownConradyLens, LensSettings
+from gripmon.model.gripper import Gripper
+from gripmon.simulate import PAPER_LENS, Scenario, Simulator, paper_rig
+from gripmon.simulate import paper_cam_T_grip as nominal_cam_T_grip
 from gripmon.simulate.scenario import Background, FingerLook, Sensor
+from support.grippers import gripper_from_dict
+
+__all__ = ["PAPER_LENS", "nominal_cam_T_grip"]
 
 BOX_FINGERS = Path(__file__).resolve().parents[2] / "configs" / "grippers" / "two_box_fingers.yaml"
-PAPER_LENS = PaperLens(
-    width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
-)
 STRONG_LENS = BrownConradyLens(
     width_px=768,
     height_px=576,
@@ -39,24 +40,23 @@ def plain_scenario(**settings: object) -> Scenario:
     return Scenario(**{**sections, **settings})  # type: ignore[arg-type]
 
 
-def nominal_cam_T_grip(
-    tilt_deg: float = 32.0, tcp_m: tuple[float, float, float] = (0.0004, 0.0013, 0.115)
-) -> np.ndarray:
-    """Camera tilted about its x axis against the gripper, as in the paper."""
-    c, s = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
-    cam_T_grip = np.eye(4)
-    cam_T_grip[:3, :3] = [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
-    cam_T_grip[:3, 3] = tcp_m
-    return cam_T_grip
+def box_model(bevel_m: float = 0.0) -> dict[str, Any]:
+    """The file of the box fingers as values, with a bevel of that width on every edge."""
+    model: dict[str, Any] = yaml.safe_load(BOX_FINGERS.read_text())
+    for edge in model["edges"].values():
+        edge["bevel_m"] = bevel_m
+    return model
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=8)
+def bevelled(width_m: float) -> Gripper:
+    """The box fingers, every edge cut off by a bevel."""
+    return gripper_from_dict(box_model(width_m))
+
+
 def sharp_gripper() -> Gripper:
     """The box fingers without bevels."""
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    return Gripper(msgspec.convert(model, GripperModel))
+    return bevelled(0.0)
 
 
 def simulator(
@@ -68,6 +68,4 @@ def simulator(
     cam_T_grip: np.ndarray | None = None,
 ) -> Simulator:
     gripper = sharp_gripper() if sharp else read_gripper(BOX_FINGERS)
-    return Simulator(
-        make_camera(lens), gripper, nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip, scenario, seed
-    )
+    return paper_rig(gripper, cam_T_grip, lens).simulator(scenario, seed)

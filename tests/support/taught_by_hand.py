@@ -17,7 +17,7 @@ from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import read_image
 from gripmon.model.records import Image
-from support.simulated import BOX_FINGERS, nominal_cam_T_grip
+from support.simulated import box_model, nominal_cam_T_grip
 
 SCENARIO = {
     "name": "table",
@@ -67,10 +67,7 @@ class Rig:
 
 def make_rig(folder: Path) -> Rig:
     """Simulate it, with sharp fingers before an even table."""
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    (folder / "gripper.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
+    (folder / "gripper.yaml").write_text(yaml.safe_dump(box_model(), sort_keys=False))
     values = yaml.safe_load(builtin_config("demo.yaml").read_text())
     transform = msgspec.to_builtins(to_record(nominal_cam_T_grip()))
     values["reference"]["cam_T_grip"] = {key: list(value) for key, value in transform.items()}

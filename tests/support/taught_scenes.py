@@ -4,37 +4,25 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import msgspec
 import numpy as np
-import yaml
 
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import to_record
-from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
 from gripmon.monitor import MonitorSettings
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, JawScript
 from gripmon.teach.measure import Taught, teach
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
 from support.meters import JAW_SIGMA_M, NARROW, USUAL_SHARE, box_gripper, difference
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import PAPER_LENS, bevelled, nominal_cam_T_grip, plain_scenario
 
 CAMERA = make_camera(PAPER_LENS)
 RIG = Rig(CAMERA, box_gripper(), MonitorSettings(jaw_sigma_m=JAW_SIGMA_M))
 OPENING_M = 0.034
 TABLE_DN = 180.0
-
-
-@lru_cache(maxsize=8)
-def bevelled(width_m: float) -> Gripper:
-    """The box fingers with every edge cut off by a bevel."""
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge["bevel_m"] = width_m
-    return Gripper(msgspec.convert(model, GripperModel))
 
 
 def table(level_dn: float) -> Background:
@@ -49,8 +37,7 @@ def scene(level_dn: float = TABLE_DN, opening_m: float = OPENING_M) -> Scenario:
 @lru_cache(maxsize=64)
 def _image(width_m: float, scenario: Scenario, pose_bytes: bytes) -> Image:
     pose = np.frombuffer(pose_bytes).reshape(4, 4)
-    gripper = bevelled(width_m) if width_m else box_gripper()
-    image = Simulator(CAMERA, gripper, pose, scenario, 1).render(0)
+    image = paper_rig(bevelled(width_m), pose).simulator(scenario, 1).render(0)
     image.flags.writeable = False
     return image
 

@@ -22,7 +22,7 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
+from gripmon.simulate import FrameTruth, Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import Background, Cover, Creep
 from support.kept import kept
 from support.meters import box_gripper, difference
@@ -90,7 +90,7 @@ def rendered(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, .
 
 @kept
 def _rendered(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
-    simulator = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
+    simulator = paper_rig(box_gripper(sharp=False)).simulator(scenario, 1)
     frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     return frames, tuple(simulator.truth(i) for i in range(len(frames)))
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.causes_rigs import START_SIGMA
 from benchmarks.causes_trials import Trial
+from benchmarks.drawn import REFERENCE_SIGMA
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
@@ -32,7 +32,7 @@ class Told:
 def run(trial: Trial) -> Told:
     """Show a trial to a monitor."""
     rig = trial.rig
-    covariance = tuple(np.diag(START_SIGMA**2).ravel().tolist())
+    covariance = tuple(np.diag(REFERENCE_SIGMA**2).ravel().tolist())
     reference = ReferenceRecord("start", 1, 0, "configuration", to_record(rig.start_cam_T_grip), covariance)
     settings = MonitorSettings(
         jaw_sigma_m=rig.jaw_sigma_m,

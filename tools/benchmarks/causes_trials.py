@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks.causes_rigs import AFTER, WELL, Rig, Rng, draw_rig
+from benchmarks.causes_rigs import AFTER, WELL, Rig, draw_rig
+from benchmarks.drawn import Rng
 from gripmon.model.camera import LensSettings, PaperLens
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Array, Cause, Frame, Image

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Rig, Scenario
 
 CAMERA = "observation.images.wrist"
 FPS, SECONDS, RENDERED = 30, 10, 4
@@ -58,7 +58,7 @@ def render(folder: Path, config: Path) -> list[list[float]]:
         scenario = Scenario(name="episode", duration_s=float(SECONDS), fps=float(FPS))
         # Mountings some millimetres apart, as a fleet has them.
         cam_T_grip = perturb(loaded.cam_T_grip, np.array([0.001 * (number % 2), 0.0, 0.001 * (number // 2), 0, 0, 0.0]))
-        simulator = Simulator(loaded.camera, loaded.gripper, cam_T_grip, scenario, number)
+        simulator = Rig(loaded.camera, loaded.gripper, cam_T_grip).simulator(scenario, number)
         frames = [simulator.frame(i) for i in range(simulator.frame_count)]
         write_video(_video(folder, number), [np.asarray(frame.image) for frame in frames], FPS)
         openings_m.append([float(frame.jaw_opening_m or 0.0) for frame in frames])

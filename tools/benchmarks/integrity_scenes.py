@@ -13,16 +13,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks import padded
+from benchmarks import drawn, padded
+from benchmarks.drawn import Place, finger_look, in_view
+from benchmarks.fingers import first_finger, gripper_models, gripper_of
 from benchmarks.integrity_draft import Condition, Draft, Fingers
 from benchmarks.rounded import rounded_model, rounded_solids
-from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
 from gripmon.model.camera import Camera, PaperLens, make_camera
-from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulate import Scenario, Simulator
-from gripmon.simulate.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
+from gripmon.simulate import PAPER_LENS, Rig, Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerMark, JawScript, Sensor
 
 LEAD_FRAMES = (15, 20)
 """Frames at the start of a scene in which the gripper is seen free."""
@@ -33,7 +34,6 @@ MARKED_SHARE = 0.35
 SHORT_PX = (20.0, 30.0)
 """Of fingers that the image's border cuts off."""
 _INSIDE_AT = (0.3, 0.6)
-_BORDER_PX = 14.0
 _KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
 _JAW_NOISE_M = 3e-5
 
@@ -68,20 +68,19 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
     cam_T_grip, opening_m = _PLACED.get(condition.fingers, _placed)(rng, camera, shown)
     draft = _draft(rng, frames, shown, cam_T_grip, opening_m)
     if condition.truth is not None:
-        shown = Gripper(msgspec.convert(condition.truth(rng, msgspec.to_builtins(gripper.model)), GripperModel))
+        shown = gripper_of(condition.truth(rng, msgspec.to_builtins(gripper.model)))
     scenario = _scenario(condition, draft)
     if not shown.has_jaw:
         scenario = msgspec.structs.replace(scenario, jaw=JawScript())
-    simulator = Simulator(camera, shown, cam_T_grip, scenario, seed=int(rng.integers(2**31)))
-    sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
+    simulator = Rig(camera, shown, cam_T_grip).simulator(scenario, int(rng.integers(2**31)))
     inside = condition.inside and rng.random() < INSIDE_SHARE
     first = round(draft.at_s(float(rng.uniform(*_INSIDE_AT))) * draft.fps) if inside else 0
     return IntegrityScene(
         condition=condition,
         simulator=simulator,
         gripper=gripper,
-        start_cam_T_grip=perturb(simulator.truth(first).cam_T_grip, rng.normal(0.0, sigma)),
-        start_covariance=np.diag(sigma**2),
+        start_cam_T_grip=drawn.reference(rng, simulator.truth(first).cam_T_grip),
+        start_covariance=np.diag(drawn.REFERENCE_SIGMA**2),
         jaw_sigma_m=0.0 if scenario.jaw.reported_noise_m == 0.0 and not scenario.jaw.reported_offset_m else None,
         first=first,
         frames=frames,
@@ -96,21 +95,8 @@ def _grippers(fingers: Fingers, number: int, rng: np.random.Generator) -> tuple[
         return padded.padded_model(), padded.padded_solids()
     models = gripper_models()
     model = models[number % len(models)]
-    gripper = Gripper(msgspec.convert(_first_finger(model) if fingers is Fingers.ONE else model, GripperModel))
+    gripper = gripper_of(first_finger(model) if fingers is Fingers.ONE else model)
     return gripper, gripper
-
-
-def _first_finger(model: dict[str, Any]) -> dict[str, Any]:
-    """A model's first finger alone, which stands still; the TCP stays where it is."""
-    own = next(iter(model["fingers"]))
-    points = {name: point for name, point in model["points"].items() if point["finger"] == own}
-    return {
-        "name": f"{model['name']}, one",
-        "fingers": {own: {}},
-        "points": points,
-        "edges": {name: edge for name, edge in model["edges"].items() if edge["from"] in points},
-        "faces": [face for face in model["faces"] if face["finger"] == own],
-    }
 
 
 def _round_tipped(rng: np.random.Generator) -> tuple[Gripper, Gripper]:
@@ -146,11 +132,8 @@ def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: 
         speed_m_per_s=float(rng.uniform(0.03, 0.12)),
         motion=str(rng.choice(("wander", "linear", "stop_and_go"))),  # type: ignore[arg-type]
     )
-    fingers = FingerLook(
-        level_dn=float(rng.uniform(50.0, 170.0)),
-        ambient=float(rng.uniform(0.25, 0.5)),
-        lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
-        texture=float(rng.uniform(0.03, 0.2)),
+    fingers = msgspec.structs.replace(
+        finger_look(rng, level_dn=(50.0, 170.0), texture=(0.03, 0.2)),
         highlights=float(rng.uniform(0.0, 2.0)) if rng.random() < 0.2 else 0.0,
         marks=_marks(rng) if rng.random() < MARKED_SHARE else (),
     )
@@ -202,7 +185,7 @@ def _camera(rng: np.random.Generator) -> Camera:
     """Mostly that of the paper; some smaller ones, and other focal lengths."""
     kind = rng.random()
     if kind < 0.6:
-        return make_camera(CAMERA)
+        return make_camera(PAPER_LENS)
     width, height = (640, 480) if kind < 0.8 else (768, 576)
     focal_px = float(rng.uniform(0.75, 1.35)) * width
     middle = (0.5 * np.array([width, height]) - 0.5 + rng.uniform(-8.0, 8.0, 2)).tolist()
@@ -221,18 +204,16 @@ def _camera(rng: np.random.Generator) -> Camera:
 
 def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
     """A pose and an opening at which all of the fingertips are in the image, also some millimetres wider."""
-    for _ in range(10000):
+
+    def draw(rng: np.random.Generator) -> Place:
         turn = exp_rotation(np.deg2rad([rng.uniform(20.0, 45.0), rng.uniform(-5.0, 5.0), rng.uniform(-5.0, 5.0)]))
         depth_m = rng.uniform(0.08, 0.2)
         tcp_m = np.array([*rng.uniform(-0.06, 0.06, 2) * depth_m, depth_m])
         opening_m = gripper.jaw_nominal_m + float(rng.uniform(-14e-3, 10e-3))
         opening_m = min(max(opening_m, 10e-3), gripper.jaw_max_m - 4e-3)
-        corners = gripper.points_grip_m(opening_m + 4e-3)[gripper.corner_points]
-        uv = camera.project(corners @ turn.T + tcp_m)
-        limit = np.array([camera.width_px, camera.height_px]) - 1.0 - _BORDER_PX
-        if (uv > _BORDER_PX).all() and (uv < limit).all():
-            return make_transform(turn, tcp_m), opening_m
-    raise ValueError(f"gripper {gripper.name} does not fit into the image")
+        return Place(turn, tcp_m, opening_m, gripper.points_grip_m(opening_m + 4e-3)[gripper.corner_points])
+
+    return in_view(rng, camera, draw)
 
 
 def _placed_short(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:

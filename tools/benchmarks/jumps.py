@@ -12,19 +12,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
-from benchmarks.machine import ROOT
-from gripmon.daemon.config import read_gripper
-from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from benchmarks.drawn import lenses
+from benchmarks.fingers import gripper_of, shipped, wedge_fingers
+from gripmon import simulate
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturb
-from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario
 from gripmon.simulate.disturbance import full_motion
 from gripmon.simulate.scenario import Background, JawScript, MountMotion, Tilt
 
@@ -69,64 +69,14 @@ class Trial:
     after_cam_T_grip: FloatArray
 
 
-def wedge_fingers() -> Gripper:
-    """Slim fingers of five-sided outline: the outer side slopes towards the tip."""
-    outline = ((0.0, 0.0), (0.004, 0.0), (0.011, -0.016), (0.011, -0.045), (0.0, -0.045))  # x outward, z
-    hidden = "34"  # the back end lies in the body that carries the finger
-    points, edges, faces, fingers = {}, {}, [], {}
-    for name, sign in (("left", -1.0), ("right", 1.0)):
-        fingers[name] = {"motion": {"axis": [0.5 * sign, 0.0, 0.0]}}
-        for side, y in (("near", -0.006), ("far", 0.006)):
-            for k, (x, z) in enumerate(outline):
-                points[f"{name}_{side}_{k}"] = {
-                    "finger": name, "xyz_m": [sign * (0.014 + x), y, z], "corner": k < 3,
-                }  # fmt: skip
-        count = len(outline)
-        for k in range(count):
-            after = (k + 1) % count
-            near, far = (f"{name}_near_{k}", f"{name}_near_{after}"), (f"{name}_far_{k}", f"{name}_far_{after}")
-            for start, end in (near, far, (near[0], far[0])):
-                if start[-1] not in hidden or end[-1] not in hidden:
-                    edges[f"{start}-{end}"] = {"from": start, "to": end}
-            loop = [near[0], far[0], far[1], near[1]]
-            faces.append({"finger": name, "points": loop if sign < 0.0 else loop[::-1]})
-        for side in ("near", "far"):
-            loop = [f"{name}_{side}_{k}" for k in range(count)]
-            faces.append({"finger": name, "points": loop if (side == "far") == (sign > 0.0) else loop[::-1]})
-    jaw = {"nominal_m": 0.028, "min_m": 0.0, "max_m": 0.05}
-    model = {"name": "wedge_fingers", "jaw": jaw, "fingers": fingers, "points": points, "edges": edges, "faces": faces}
-    return Gripper(msgspec.convert(model, GripperModel))
-
-
 @cache
 def rigs() -> dict[str, Rig]:
     """Grippers of three shapes before three cameras."""
-    folder = ROOT / "configs" / "grippers"
-    paper = PaperLens(
-        width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
-    )
-    brown = BrownConradyLens(
-        width_px=640,
-        height_px=480,
-        fx_px=655.0,
-        fy_px=653.0,
-        cx_px=322.0,
-        cy_px=236.0,
-        coefficients=(-0.31, 0.11, 0.0012, -0.0008),
-    )
-    fisheye = FisheyeLens(
-        width_px=1280,
-        height_px=720,
-        fx_px=790.0,
-        fy_px=790.0,
-        cx_px=641.0,
-        cy_px=357.0,
-        coefficients=(0.03, -0.02, 0.004, 0.0),
-    )
+    lens = lenses()
     return {
-        "boxes": Rig(paper, read_gripper(folder / "two_box_fingers.yaml"), 0.118, 32.0, (0.016, 0.044)),
-        "tapered": Rig(brown, read_gripper(folder / "adaptive_arc_fingers.yaml"), 0.125, 36.0, (0.02, 0.055)),
-        "wedges": Rig(fisheye, wedge_fingers(), 0.095, 38.0, (0.012, 0.044)),
+        "boxes": Rig(lens["paper"], gripper_of(shipped("two_box_fingers")), 0.118, 32.0, (0.016, 0.044)),
+        "tapered": Rig(lens["wide"], gripper_of(shipped("adaptive_arc_fingers")), 0.125, 36.0, (0.02, 0.055)),
+        "wedges": Rig(lens["fisheye"], gripper_of(wedge_fingers()), 0.095, 38.0, (0.012, 0.044)),
     }
 
 
@@ -193,7 +143,7 @@ class Scene:
             jaw=JawScript(knots=((0.0, opening_m),)),
             background=_BACKGROUNDS[background],
         )
-        self._simulator = Simulator(self.camera, rig.gripper, shown, scenario, int(rng.integers(2**31)))
+        self._simulator = simulate.Rig(self.camera, rig.gripper, shown).simulator(scenario, int(rng.integers(2**31)))
 
     def trial(self, index: int, before: int, after: int) -> Trial:
         """The frames about jump ``index``."""

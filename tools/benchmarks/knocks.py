@@ -13,29 +13,25 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from benchmarks import jumps
-from benchmarks.machine import ROOT
-from benchmarks.scenes import tapered_gripper
-from gripmon.daemon.config import read_gripper
-from gripmon.model.camera import Camera, LensSettings, make_camera
-from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.model.gripper import Gripper, GripperModel
+from benchmarks import drawn, jumps
+from benchmarks.drawn import Place, in_view, lenses
+from benchmarks.fingers import gripper_models, gripper_of, wedge_fingers
+from gripmon.model.camera import Camera, make_camera
+from gripmon.model.geometry import exp_rotation
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Rig, Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
     BentFinger,
     Cover,
     Defocus,
-    FingerLook,
     GraspedObject,
     JawScript,
     Light,
     LightStep,
-    Sensor,
 )
 
 FPS = 30.0
@@ -44,9 +40,6 @@ LARGEST_M, LARGEST_RAD = 0.015, math.radians(8.0)
 
 BEFORE = 4
 """Frames before the knock."""
-
-REFERENCE_SIGMA_M, REFERENCE_SIGMA_RAD = 1e-4, 1e-3
-"""By how much the reference before the knock is wrong, per axis; the monitor knows this."""
 
 JAWS = ("rests", "moves", "moves, noise", "moves, offset", "rests, offset", "unreported")
 JAW_SHARES = (0.35, 0.25, 0.1, 0.1, 0.1, 0.1)
@@ -91,8 +84,8 @@ def draw_knock(seed: int, number: int) -> Knock:
     """Trial ``number``."""
     rng = np.random.default_rng([seed, 77, number])
     grippers = _grippers()
-    gripper_name, lens_name = str(rng.choice(list(grippers))), str(rng.choice(list(_lenses())))
-    gripper, camera = grippers[gripper_name], make_camera(_lenses()[lens_name])
+    gripper_name, lens_name = str(rng.choice(list(grippers))), str(rng.choice(list(lenses())))
+    gripper, camera = grippers[gripper_name], make_camera(lenses()[lens_name])
     cam_T_grip, opening_m = _placed(rng, camera, gripper)
     background_name, still = str(rng.choice(jumps.BACKGROUNDS)), bool(rng.random() < 0.4)
     jaw = str(rng.choice(JAWS, p=JAW_SHARES)) if gripper.has_jaw else "none"
@@ -110,18 +103,11 @@ def draw_knock(seed: int, number: int) -> Knock:
         "mount": (jumps.tilt(xi, pivot_m, cam_T_grip[:3, 3], knock_s),),
         "jaw": script,
         "background": _background(rng, background_name, still),
-        "fingers": FingerLook(
-            level_dn=float(rng.uniform(70.0, 150.0)),
-            ambient=float(rng.uniform(0.25, 0.5)),
-            lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
-            texture=float(rng.uniform(0.05, 0.2)),
-            carriers=gripper.has_jaw,
-        ),
-        "sensor": Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8))),
+        "fingers": msgspec.structs.replace(drawn.finger_look(rng), carriers=gripper.has_jaw),
+        "sensor": drawn.sensor(rng),
     }
     sections |= _what_else(rng, also, gripper, opening_m, knock_s)
-    simulator = Simulator(camera, gripper, cam_T_grip, Scenario(**sections), int(rng.integers(2**31)))
-    sigma = np.array([REFERENCE_SIGMA_M] * 3 + [REFERENCE_SIGMA_RAD] * 3)
+    simulator = Rig(camera, gripper, cam_T_grip).simulator(Scenario(**sections), int(rng.integers(2**31)))
     return Knock(
         number=number,
         gripper=gripper_name,
@@ -133,8 +119,8 @@ def draw_knock(seed: int, number: int) -> Knock:
         camera=camera,
         model=gripper,
         simulator=simulator,
-        start_cam_T_grip=perturb(cam_T_grip, rng.normal(0.0, sigma)),
-        start_covariance=np.diag(sigma**2),
+        start_cam_T_grip=drawn.reference(rng, cam_T_grip),
+        start_covariance=np.diag(drawn.REFERENCE_SIGMA**2),
         jaw_sigma_m=sigma_m,
     )
 
@@ -147,7 +133,8 @@ def _xi(rng: np.random.Generator) -> Array:
 
 def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
     """A pose and an opening at which all corners are inside the image."""
-    for _ in range(10000):
+
+    def draw(rng: np.random.Generator) -> Place:
         opening_m = gripper.jaw_nominal_m
         if gripper.has_jaw:
             opening_m = float(rng.uniform(gripper.jaw_min_m + 0.012, min(gripper.jaw_max_m - 0.008, 0.046)))
@@ -155,11 +142,9 @@ def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple
         turn = exp_rotation(np.deg2rad([0.0, *others])) @ exp_rotation(np.deg2rad([tilt, 0.0, 0.0]))
         points = gripper.points_grip_m(opening_m if gripper.has_jaw else None)[gripper.corner_points]
         tcp_m = np.array([*rng.uniform(-0.004, 0.004, 2), rng.uniform(0.092, 0.128)])
-        uv = camera.project(points @ turn.T + tcp_m)
-        limit = np.array([camera.width_px, camera.height_px]) - 1.0 - _BORDER_PX
-        if (uv > _BORDER_PX).all() and (uv < limit).all():
-            return make_transform(turn, tcp_m), opening_m
-    raise ValueError(f"gripper {gripper.name} does not fit into the image")
+        return Place(turn, tcp_m, opening_m, points)
+
+    return in_view(rng, camera, draw, _BORDER_PX)
 
 
 def _background(rng: np.random.Generator, name: str, still: bool) -> Background:
@@ -218,18 +203,7 @@ def _what_else(
 
 
 @cache
-def _lenses() -> dict[str, LensSettings]:
-    names = {"boxes": "paper", "tapered": "wide", "wedges": "fisheye"}
-    return {names[name]: rig.lens for name, rig in jumps.rigs().items()}
-
-
-@cache
 def _grippers() -> dict[str, Gripper]:
-    folder = ROOT / "configs" / "grippers"
-    box = yaml.safe_load((folder / "two_box_fingers.yaml").read_text(encoding="utf-8"))
-    return {
-        "boxes": read_gripper(folder / "two_box_fingers.yaml"),
-        "arcs": read_gripper(folder / "adaptive_arc_fingers.yaml"),
-        "wedges": jumps.wedge_fingers(),
-        "tapered": Gripper(msgspec.convert(tapered_gripper(box), GripperModel)),
-    }
+    box, tapered, arcs = gripper_models()
+    models = {"boxes": box, "arcs": arcs, "wedges": wedge_fingers(), "tapered": tapered}
+    return {name: gripper_of(model) for name, model in models.items()}

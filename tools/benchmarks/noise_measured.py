@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.drawn import finger_look, sensor
 from benchmarks.scene import FPS, config_for
 from gripmon.daemon.config import Config
 from gripmon.model.geometry import from_record, perturbation_between
@@ -28,7 +29,6 @@ from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,
-    FingerLook,
     JawScript,
     Light,
     LightStep,
@@ -105,13 +105,7 @@ def _background(rng: np.random.Generator, motion: str, speed_m_per_s: float) -> 
 
 
 def _look(rng: np.random.Generator) -> dict[str, Any]:
-    fingers = FingerLook(
-        level_dn=float(rng.uniform(70.0, 150.0)),
-        ambient=float(rng.uniform(0.25, 0.5)),
-        lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
-        texture=float(rng.uniform(0.05, 0.2)),
-    )
-    return {"fingers": fingers, "sensor": Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)))}
+    return {"fingers": finger_look(rng), "sensor": sensor(rng)}
 
 
 def _quiet(rng: np.random.Generator, _: float) -> dict[str, Any]:
@@ -200,8 +194,7 @@ def simulator(regime: Regime, seed: int, scene: int, config: Config) -> Simulato
     duration_s = (regime.settling + regime.frames) / FPS
     sections = regime.changes(rng, duration_s)
     scenario = Scenario(name=f"{regime.name}-{scene}", duration_s=duration_s, fps=FPS, **sections)
-    nominal_T = from_record(config.reference.cam_T_grip)
-    return Simulator(config.camera, config.gripper, nominal_T, scenario, seed=int(rng.integers(2**31)))
+    return config.scene.simulator(scenario, int(rng.integers(2**31)))
 
 
 def measure(regime: Regime, seed: int, scene: int, step: Callable[[], object] = lambda: None) -> Series:

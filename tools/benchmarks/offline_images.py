@@ -10,31 +10,26 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.machine import ROOT
-from gripmon.daemon.config import read_gripper
-from gripmon.model.camera import LensSettings, PaperLens, make_camera
+from benchmarks.fingers import gripper_of, shipped
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.model.targets import Chequerboard, CircleGrid
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import PAPER_LENS, Scenario, Simulator, paper_rig
 from gripmon.simulate.plates import Plate, PlateBackdrop, Print
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 
-PAPER_LENS = PaperLens(
-    width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
-)
 DISCS = CircleGrid(8, 8, 0.008, 0.004)
 OPENING_M = 0.05
 """The fingers then stand near the left and the right border, as in the paper."""
 TILT_RAD = np.radians(32.0)
 DISTANCE_M = 0.115
-_GRIPPER = ROOT / "configs" / "grippers" / "two_box_fingers.yaml"
 
 
 @functools.lru_cache(maxsize=1)
 def gripper() -> Gripper:
-    return read_gripper(_GRIPPER)
+    return gripper_of(shipped("two_box_fingers"))
 
 
 @dataclass(frozen=True)
@@ -76,8 +71,7 @@ class Setting:
                 jaw=JawScript(knots=((0.0, OPENING_M),)),
                 sensor=msgspec.structs.replace(Sensor(), read_noise_dn=noise, exposure_time_s=0.0),
             )
-            camera = make_camera(PAPER_LENS)
-            made.append(Simulator(camera, gripper(), self.cam_T_grip, scenario, seed, backdrop))
+            made.append(paper_rig(gripper(), self.cam_T_grip).simulator(scenario, seed, backdrop))
         return made
 
 

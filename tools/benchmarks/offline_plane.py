@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import chi2, ncx2
 
-from benchmarks.offline_images import DISCS, OPENING_M, PAPER_LENS, Setting, gripper
+from benchmarks.offline_images import DISCS, OPENING_M, Setting, gripper
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.intrinsics import calibrate_single_view
@@ -20,6 +20,7 @@ from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
+from gripmon.simulate import PAPER_LENS
 from gripmon.simulate.scenario import Sensor
 from gripmon.teach.hand_eye import KnownGripper, UnknownGripper
 

@@ -14,7 +14,7 @@ from benchmarks import rendered
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, invert, perturb
+from gripmon.model.geometry import invert, perturb
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.simulate import Simulator, make_scenario
@@ -120,11 +120,10 @@ def all_series(seed: int) -> list[Series]:
     there.
     """
     config = load_config(builtin_config("demo.yaml"), check_source=False)
-    nominal = from_record(config.reference.cam_T_grip)
 
     def simulated(name: str, scene: str, **changes: object) -> SimulatedSeries:
         scenario = msgspec.structs.replace(make_scenario(name), **changes)
-        return SimulatedSeries(name, scene, Simulator(config.camera, config.gripper, nominal, scenario, seed))
+        return SimulatedSeries(name, scene, config.scene.simulator(scenario, seed))
 
     out: list[Series] = []
     for name in ("series1", "series2"):

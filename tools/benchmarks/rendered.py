@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.conditions import CLEAN, HARD, Limit
+from benchmarks.drawn import REFERENCE_SIGMA
 from benchmarks.machine import ROOT
-from benchmarks.scenes import START_SIGMA_M, START_SIGMA_RAD, Sequence, Shot
+from benchmarks.scenes import Sequence, Shot
 from benchmarks.tags import FingerTags, with_tags
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
@@ -103,14 +104,13 @@ def sequences(row: str) -> list[Rendered]:
         kappa_per_px2=float(camera["k"]),
     )
     model = Gripper(msgspec.convert(_converter().gripper_model(gripper), GripperModel))
-    sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
 
     def part(frames: list[dict[str, Any]], start: Any, repeat: int, judged_from: int) -> Rendered:
         return Rendered(
             make_camera(lens),
             model,
             np.array(start),
-            np.diag(sigma**2),
+            np.diag(REFERENCE_SIGMA**2),
             0.0 if true_jaw else None,
             None,
             float(truth["fps"]),

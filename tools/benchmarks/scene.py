@@ -18,9 +18,8 @@ from benchmarks import tags
 from benchmarks.machine import ROOT
 from gripmon.daemon.config import Config, load_config
 from gripmon.model.camera import PaperLens, make_camera
-from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame
-from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Background, Bump, Cover, Creep
 
 FPS = 60.0
@@ -108,7 +107,7 @@ def render(size: Size, count: int, step: Callable[[], object] = lambda: None, *,
     """A ring of ``count`` frames of a kind (:data:`KINDS`); ``step`` is called after each (for a progress bar)."""
     config, goes = config_for(size), kind in ("hidden", "lost")
     scenario = _scenario(kind, count)
-    simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)
+    simulator = config.scene.simulator(scenario, seed=1)
     shape = (count, config.camera.height_px, config.camera.width_px)
     ring = Ring(
         np.zeros(shape, np.uint8),

@@ -93,15 +93,13 @@ def track(shape: Shape, most_m: float, most_rad: float, frames: int, seed: int, 
     import numpy as np
 
     from benchmarks.meshes import MeshCamera, wandering, write_meshes
-    from gripmon.model.camera import PaperLens, make_camera
+    from gripmon.model.camera import make_camera
     from gripmon.model.records import Frame, Origin, Verdict
     from gripmon.monitor import Monitor, MonitorSettings
+    from gripmon.simulate import PAPER_LENS
     from gripmon.teach.cad import gripper_from_cad
 
-    lens = PaperLens(
-        width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
-    )
-    camera, meshes = make_camera(lens), shape.meshes()[: shape.fingers]
+    camera, meshes = make_camera(PAPER_LENS), shape.meshes()[: shape.fingers]
     pose = _pose(camera, shape.cut)
     jaw_range_m = (0.0, 0.06) if shape.fingers > 1 else None
     paths = write_meshes(meshes, folder)
@@ -150,10 +148,9 @@ def _pose(camera: Any, cut: bool) -> Any:
     """
     import numpy as np
 
-    c, s = np.cos(np.deg2rad(32.0)), np.sin(np.deg2rad(32.0))
-    cam_T_grip = np.eye(4)
-    cam_T_grip[:3, :3] = [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
-    cam_T_grip[:3, 3] = 0.0004, 0.0013, 0.115
+    from gripmon.simulate import paper_cam_T_grip
+
+    cam_T_grip = paper_cam_T_grip()
     tip = cam_T_grip[:3, :3] @ np.array([0.022, -0.008, 0.0])
     if cut:
         for _ in range(20):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.client import Policy, Reading
-from gripmon.model.geometry import from_record, invert
+from gripmon.model.geometry import invert
 from gripmon.model.records import Array, Verdict
 from gripmon.simulate import Simulator
 from servoing import stage
@@ -76,9 +76,7 @@ def run(row: stage.Row, number: int, seed: int, fps: float, *, realtime: bool, s
         folder = Path(name)
         simulator_seed = int(rng.integers(2**32))
         config = write_config(folder, scenario, simulator_seed, free_endpoint(), realtime=realtime)
-        simulator = Simulator(
-            config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, simulator_seed
-        )
+        simulator = config.scene.simulator(scenario, simulator_seed)
         assert scenario.grasped is not None
         eye = Eye(config.camera, object_points_m(scenario.grasped))
         arms = _Arms(simulator, eye, arm, base_T_object, start, fps, seeds)

@@ -30,7 +30,7 @@ from gripmon.daemon.config.project import file_of
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
-from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings, SimulatedScene, SimulatedSettings
+from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings, SimulatedSettings
 from gripmon.io.wire import Joining
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
@@ -41,7 +41,7 @@ from gripmon.track.edges import TaughtEdges, TaughtModel
 from gripmon.track.edges.taught import mismatch, own_covariance
 
 if TYPE_CHECKING:
-    from gripmon.simulate import Scenario
+    from gripmon.simulate import Rig, Scenario
 
 __all__ = [
     "Config",
@@ -129,9 +129,11 @@ class Config:
         return self.gripper.jaw_nominal_m if self.settings.jaw.opening_m is None else self.settings.jaw.opening_m
 
     @property
-    def scene(self) -> SimulatedScene:
-        """The scene of a simulated camera; undisturbed, it is at the reference."""
-        return SimulatedScene(self.camera, self.gripper, self.cam_T_grip)
+    def scene(self) -> Rig:
+        """What a simulated camera sees; undisturbed, it is at the reference."""
+        from gripmon.simulate import Rig
+
+        return Rig(self.camera, self.gripper, self.cam_T_grip)
 
     def view(self) -> View:
         """What should be visible at the reference and :attr:`jaw_opening_m`."""

@@ -7,6 +7,7 @@ All are a :class:`Source`; :func:`open_source` makes one from its settings, and 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -18,8 +19,11 @@ from gripmon.io.sources.live import LiveCamera, LiveSettings
 from gripmon.io.sources.network import ArrivingCamera, NetworkCamera, NetworkSettings
 from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.ros2 import Ros2Camera, Ros2CameraSettings
-from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
+from gripmon.io.sources.simulated import SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link
+
+if TYPE_CHECKING:
+    from gripmon.simulate import Rig
 
 EpisodeSettings = BagSettings | LeRobotSettings
 SourceSettings = (
@@ -51,7 +55,6 @@ __all__ = [
     "OpenedSource",
     "Ros2Camera",
     "Ros2CameraSettings",
-    "SimulatedScene",
     "SimulatedSettings",
     "Source",
     "SourceError",
@@ -72,7 +75,7 @@ def open_source(
     settings: SourceSettings,
     relative_to: Path = Path(),
     *,
-    scene: SimulatedScene | None = None,
+    scene: Rig | None = None,
     size_px: tuple[int, int] | None = None,
     link: Link | None = None,
     keys: Keys | None = None,

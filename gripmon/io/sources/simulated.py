@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +9,10 @@ import msgspec
 
 from gripmon.io.sources.base import Source, SourceError, Stored
 from gripmon.model.errors import one_line
-from gripmon.model.records import Array, Frame
+from gripmon.model.records import Frame
 
 if TYPE_CHECKING:
-    from gripmon.model.camera import Camera
-    from gripmon.model.gripper import Gripper
-    from gripmon.simulate import Scenario, Simulator
+    from gripmon.simulate import Rig, Scenario, Simulator
 
 
 class SimulatedSettings(
@@ -50,22 +47,11 @@ class SimulatedSettings(
     ] = 2
 
 
-@dataclass(frozen=True)
-class SimulatedScene:
-    """The simulator's input besides its settings: ``cam_T_grip`` (4, 4) is the calibration before any disturbance."""
-
-    camera: Camera
-    gripper: Gripper
-    cam_T_grip: Array
-
-
-def make_simulator(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Simulator:
+def make_simulator(settings: SimulatedSettings, scene: Rig, relative_to: Path) -> Simulator:
     """The simulator for these settings, which also has the truth; SourceError if they don't fit the scene."""
-    from gripmon.simulate import Simulator
-
     scenario = _load_scenario(settings, relative_to)
     try:
-        return Simulator(scene.camera, scene.gripper, scene.cam_T_grip, scenario, settings.seed)
+        return scene.simulator(scenario, settings.seed)
     except ValueError as error:
         raise SourceError(f"scenario: {error}") from error
 
@@ -111,7 +97,7 @@ class SimulatedSequence(Stored):
         self._count = 0
 
 
-def open_simulated(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Source:
+def open_simulated(settings: SimulatedSettings, scene: Rig, relative_to: Path) -> Source:
     """The simulated camera, live or as a sequence, depending on the settings."""
     simulator = make_simulator(settings, scene, relative_to)
     if not settings.realtime:

@@ -1,0 +1,88 @@
+"""What every benchmark draws alike for its scenes: lenses, places at which the gripper is in view, looks, references.
+
+Each benchmark names its own ranges.  The order of the draws is part of a scene: seeds name the same scenes for good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings
+from gripmon.model.geometry import make_transform, perturb
+from gripmon.model.records import Array
+from gripmon.simulate import PAPER_LENS
+from gripmon.simulate.scenario import FingerLook, Sensor
+
+Rng = np.random.Generator
+
+REFERENCE_SIGMA = np.array([1e-4] * 3 + [1e-3] * 3)
+"""By how much a scene's reference is wrong, per axis, m and rad; the monitor knows this."""
+BORDER_PX = 14.0
+"""Least distance of what has to be seen from the image's border."""
+_TRIES = 10_000
+
+
+@cache
+def lenses() -> dict[str, LensSettings]:
+    """One of each model."""
+    return {
+        "paper": PAPER_LENS,
+        "wide": BrownConradyLens(
+            width_px=640, height_px=480, fx_px=655.0, fy_px=653.0, cx_px=322.0, cy_px=236.0,
+            coefficients=(-0.31, 0.11, 0.0012, -0.0008),
+        ),
+        "fisheye": FisheyeLens(
+            width_px=1280, height_px=720, fx_px=790.0, fy_px=790.0, cx_px=641.0, cy_px=357.0,
+            coefficients=(0.03, -0.02, 0.004, 0.0),
+        ),
+    }  # fmt: skip
+
+
+class Place(NamedTuple):
+    """Where the gripper is: rotation (3, 3) and translation (3,) of ``cam_T_grip``, the jaw's opening, and points
+    (n, 3) of the gripper frame that have to be in the image.
+    """
+
+    cam_R_grip: Array
+    tcp_m: Array
+    opening_m: float
+    seen_m: Array
+
+
+def in_view(
+    rng: Rng, camera: Camera, draw: Callable[[Rng], Place], border_px: float = BORDER_PX
+) -> tuple[Array, float]:
+    """``cam_T_grip`` (4, 4) and opening (m) of the first drawn place at which all is in the image that has to be."""
+    limit_px = np.array([camera.width_px, camera.height_px]) - 1.0 - border_px
+    for _ in range(_TRIES):
+        place = draw(rng)
+        uv = camera.project(place.seen_m @ place.cam_R_grip.T + place.tcp_m)
+        if (uv > border_px).all() and (uv < limit_px).all():
+            return make_transform(place.cam_R_grip, place.tcp_m), place.opening_m
+    raise ValueError(f"of {_TRIES} places none has the whole gripper in the image")
+
+
+def finger_look(
+    rng: Rng, level_dn: tuple[float, float] = (70.0, 150.0), texture: tuple[float, float] = (0.05, 0.2)
+) -> FingerLook:
+    """Metal under a lamp from any side."""
+    return FingerLook(
+        level_dn=float(rng.uniform(*level_dn)),
+        ambient=float(rng.uniform(0.25, 0.5)),
+        lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
+        texture=float(rng.uniform(*texture)),
+    )
+
+
+def sensor(rng: Rng) -> Sensor:
+    """Of a lens that is more or less sharp."""
+    return Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)))
+
+
+def reference(rng: Rng, cam_T_grip: Array) -> Array:
+    """A calibration (4, 4) that is off by :data:`REFERENCE_SIGMA`."""
+    return perturb(cam_T_grip, rng.normal(0.0, REFERENCE_SIGMA))
