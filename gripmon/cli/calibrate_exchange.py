@@ -73,7 +73,7 @@ def _name(text: str) -> str:
 
 
 @Command(
-    "import", "a camera or a hand/eye transform from another program's file", _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
+    _IMPORT_OPTIONS, _IMPORT_EXAMPLES,
     size=_size, model={"choices": ("brown_conrady", "fisheye")}, out=REQUIRED,
 )  # fmt: skip
 def import_(arguments: Arguments) -> None:
@@ -94,7 +94,7 @@ def import_(arguments: Arguments) -> None:
 
 
 @Command(
-    "export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2", _EXPORT_OPTIONS, _EXPORT_EXAMPLES,
+    _EXPORT_OPTIONS, _EXPORT_EXAMPLES,
     {"frames of a hand/eye transform": (None, _EXPORT_FRAMES)},
     format={"required": True, "choices": (*CAMERA_FORMATS, *HAND_EYE_FORMATS)}, name=_name,
 )  # fmt: skip

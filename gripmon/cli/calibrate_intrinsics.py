@@ -41,7 +41,7 @@ nothing is written then"""
 
 
 @Command(
-    "intrinsics", "a camera from images of a flat target", _OPTIONS, _EXAMPLES, target=REQUIRED,
+    _OPTIONS, _EXAMPLES, target=REQUIRED,
     model={"choices": (*MODELS, "auto")}, fix={"default": []}, out=REQUIRED,
 )  # fmt: skip
 def intrinsics(arguments: Arguments) -> None:

@@ -54,7 +54,7 @@ nothing is written then"""
 
 
 @Command(
-    "plane", "camera to gripper, from images of it on a plate", _OPTIONS, _EXAMPLES, target=REQUIRED,
+    _OPTIONS, _EXAMPLES, target=REQUIRED,
     jaw_opening=jaw_opening, jaw_range=jaw_range, name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip
 def plane(arguments: Arguments) -> None:

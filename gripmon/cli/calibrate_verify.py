@@ -53,7 +53,7 @@ def _share(text: str) -> float:
 
 
 @Command(
-    "verify", "do two calibrations differ, or does one still hold", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     level={"type": _share, "default": DEFAULT_LEVEL}, jaw_opening=positive_number, tolerance_mm=positive_number,
     tolerance_deg=positive_number, tolerance_px=positive_number,
 )  # fmt: skip

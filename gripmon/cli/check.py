@@ -57,7 +57,7 @@ _MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
 @Command(
-    "check", "validate a configuration and say what it will keep", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
     arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
 )  # fmt: skip

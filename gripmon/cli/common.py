@@ -1,6 +1,6 @@
 """Shared by all commands: their declaration, the files that they write, progress bars.
 
-No heavy imports at the top: this is imported for ``--help``.
+No heavy imports at the top: this is imported for a command's ``--help``.
 """
 
 from __future__ import annotations
@@ -61,15 +61,13 @@ class Command:
 
     def __init__(
         self,
-        name: str,
-        summary: str,
         options: str,
         examples: str,
         groups: Mapping[str, tuple[str | None, str]] | None = None,
         /,
         **more: Any,
     ) -> None:
-        self._name, self._summary, self._epilog = name, summary, f"examples:\n{examples}"
+        self._epilog = f"examples:\n{examples}"
         self._tables, self._more = {"": (None, options), **(groups or {})}, more
         self.arguments: dict[str, str] = {}  # by name: the option, empty for a positional one
         self.defaults: dict[str, Any] = {}
@@ -83,12 +81,9 @@ class Command:
         """Run the command; return the exit code."""
         return self._handler(arguments) or 0
 
-    def add_to(self, commands: Any) -> None:
-        """Add the command below a parser."""
-        raw, description = argparse.RawDescriptionHelpFormatter, inspect.getdoc(self._handler)
-        parser: argparse.ArgumentParser = commands.add_parser(
-            self._name, help=self._summary, description=description, epilog=self._epilog, formatter_class=raw
-        )
+    def fill(self, parser: argparse.ArgumentParser) -> None:
+        """Make a parser that of this command."""
+        parser.description, parser.epilog = inspect.getdoc(self._handler), self._epilog
         parser.set_defaults(command=self)
         self.prog = parser.prog.partition(" ")[2]
         for title, (about, table) in self._tables.items():

@@ -39,7 +39,7 @@ def _probability(text: str) -> float:
 
 
 @Command(
-    "dataset", "the extrinsics of every episode of a dataset", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     config=REQUIRED, out=REQUIRED, engine={"choices": ("local", "ray")},
     workers=whole_number(1, 4096, "isn't a number of processes; 1 or more"),
     level=_probability, tolerance_mm=positive_number, tolerance_deg=positive_number, dataset=str, address=str,

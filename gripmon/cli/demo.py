@@ -46,7 +46,7 @@ exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
 
 @Command(
-    "demo", "the whole system on a simulated camera", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     seconds={"type": positive_number, "default": 20.0}, fps=positive_number, seed={"type": seed, "default": 1},
     view=VIEW,
 )  # fmt: skip

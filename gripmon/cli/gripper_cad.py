@@ -70,7 +70,7 @@ def _bevel(text: str) -> float:
 
 
 @Command(
-    "from-cad", "from STL, OBJ, PLY, DAE, URDF or .cao", _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
+    _OPTIONS, _EXAMPLES, out=REQUIRED, length=positive_number,
     jaw_range=jaw_range, jaw_opening=jaw_opening, view=_view, frame={"default": "tcp"},
     bevel=_bevel,
 )  # fmt: skip

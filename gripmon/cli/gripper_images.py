@@ -53,7 +53,7 @@ def _box(text: str) -> tuple[int, int, int, int]:
 
 
 @Command(
-    "from-images", "from images before changing backgrounds", _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
+    _OPTIONS, _EXAMPLES, camera=REQUIRED, distance=length,
     finger_width=length, fingers={"type": int, "choices": (1, 2)}, within=_box, jaw_range=jaw_range,
     name={"default": "gripper"}, out=REQUIRED, response=RESPONSE,
 )  # fmt: skip

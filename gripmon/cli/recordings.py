@@ -84,7 +84,7 @@ _TO_STDOUT = Path("-")
 
 
 @Command(
-    "report", "what happened: when did the camera move, what is affected", _REPORT_OPTIONS, _REPORT_EXAMPLES,
+    _REPORT_OPTIONS, _REPORT_EXAMPLES,
     limit_mm=positive_number, limit_deg=positive_number,
 )  # fmt: skip
 def report(arguments: Arguments) -> None:
@@ -116,7 +116,7 @@ def report(arguments: Arguments) -> None:
         print("\n".join(f"written: {path}" for path in (arguments.out, data_path) if path is not None))
 
 
-@Command("export", "write recordings as Parquet, by robot and day", _EXPORT_OPTIONS, _EXPORT_EXAMPLES, out=REQUIRED)
+@Command(_EXPORT_OPTIONS, _EXPORT_EXAMPLES, out=REQUIRED)
 def export(arguments: Arguments) -> None:
     """Write recordings as Parquet, partitioned by robot, camera and day (UTC), so that any query engine can
     evaluate months of a whole fleet:
@@ -140,7 +140,7 @@ def export(arguments: Arguments) -> None:
 
 
 @Command(
-    "correct", "the best transform for every frame, from the whole recording", _CORRECT_OPTIONS, _CORRECT_EXAMPLES,
+    _CORRECT_OPTIONS, _CORRECT_EXAMPLES,
     out=REQUIRED,
 )  # fmt: skip
 def correct(arguments: Arguments) -> None:
@@ -165,7 +165,7 @@ def correct(arguments: Arguments) -> None:
     print("\n".join([*(run.summary() for run in done.runs), *(f"written: {path}" for path in done.written)]))
 
 
-@Command("view", "recordings in rerun's viewer, native or in a browser", _VIEW_OPTIONS, _VIEW_EXAMPLES, port=port)
+@Command(_VIEW_OPTIONS, _VIEW_EXAMPLES, port=port)
 def view(arguments: Arguments) -> int:
     """Show recordings in rerun's viewer: in a window if there is a display, otherwise as a page for a browser
     on this machine, whose address is printed.  The files of one run appear as one recording.  The command

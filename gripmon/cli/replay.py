@@ -41,7 +41,7 @@ existing FILE.rrd is kept then); 130 interrupted (FILE has the lines so far)"""
 
 
 @Command(
-    "replay", "recorded images or a video through the monitor, JSON lines out", _OPTIONS, _EXAMPLES, out=REQUIRED,
+    _OPTIONS, _EXAMPLES, out=REQUIRED,
     fps=positive_number, episode=whole_number(0, 10**9, "isn't an episode; its number, from 0"),
 )  # fmt: skip
 def replay(arguments: Arguments) -> int:

@@ -40,7 +40,7 @@ monitor of this robot and camera is on the network; 130 Ctrl-C"""
 
 
 @Command(
-    "run", "the daemon: monitor a camera, publish and record", _OPTIONS, _EXAMPLES, duration=positive_number, view=VIEW,
+    _OPTIONS, _EXAMPLES, duration=positive_number, view=VIEW,
 )  # fmt: skip
 def run(arguments: Arguments) -> int:
     """Monitor a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until

@@ -47,7 +47,7 @@ exit codes: 0 done; 2 wrong usage; 3 refused, or no reply; 130 Ctrl-C"""
 
 
 @Command(
-    "send", "send a command to a running monitor: undo, accept, state, …", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     name={"choices": _NAMES, "metavar": "COMMAND"}, id={"default": ""}, robot=REQUIRED, monitor={"default": ""},
     timeout={"type": positive_number, "default": 5.0},
 )  # fmt: skip

@@ -27,7 +27,7 @@ exit codes: 0 done; 2 wrong usage or files; 3 a step has no result, with the rea
 
 
 @Command(
-    "setup", "from a camera to a running monitor, on one page", _OPTIONS, _EXAMPLES, dir={"default": Path()},
+    _OPTIONS, _EXAMPLES, dir={"default": Path()},
     port=PAGE_PORT,
 )  # fmt: skip
 def setup(arguments: Arguments) -> None:
@@ -67,7 +67,7 @@ exit codes: 0 written; 2 wrong usage, or the target doesn't fit on the paper"""
 
 
 @Command(
-    "target", "a calibration target to print", _TARGET_OPTIONS, _TARGET_EXAMPLES,
+    _TARGET_OPTIONS, _TARGET_EXAMPLES,
     target={"default": "circles:12x10:0.008:0.004"}, pdf={"required": True}, paper={"default": "a4"},
 )  # fmt: skip
 def target(arguments: Arguments) -> None:

@@ -29,7 +29,7 @@ inputs for every step from a new gripper to a running monitor
 
 
 @Command(
-    "simulate", "write simulated images with exact truth", _OPTIONS, _EXAMPLES, seed={"type": seed, "default": 0},
+    _OPTIONS, _EXAMPLES, seed={"type": seed, "default": 0},
     seconds=positive_number, fps=positive_number,
 )  # fmt: skip
 def simulate(arguments: Arguments) -> None:
