@@ -110,10 +110,12 @@ def third(x):
 def run_one(tmp_path: Path) -> Callable[..., str]:
     """Runs a program with a compiled function, a constant and a callee from another file; its standard output."""
 
-    def run(factor: float = 2.0, third: str = "x / 3.0", cache: Path = tmp_path / "cache", **more: str) -> str:
-        (tmp_path / "one.py").write_text(ONE)
+    def run(
+        factor: float = 2.0, third: str = "x / 3.0", cache: Path = tmp_path / "cache", one: str = ONE, **more: str
+    ) -> str:
+        (tmp_path / "one.py").write_text(one)
         (tmp_path / "other.py").write_text(OTHER.format(factor=factor, third=third))
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)} | more
+        environment = os.environ | {"NUMBA_CACHE_DIR": "" if cache == Path() else str(cache)} | more
         said = subprocess.run(
             [sys.executable, "-B", tmp_path / "one.py"], env=environment, capture_output=True, text=True, timeout=300
         )
@@ -133,6 +135,14 @@ def test_a_constant_of_another_file_is_noticed(run_one: Callable[..., str]):
 def test_a_callee_of_another_file_is_noticed(run_one: Callable[..., str]):
     run_one()
     assert "12.0 Kept" in run_one(third="2.0 * x")
+
+
+def test_a_caller_is_compiled_with_a_callee_that_was_loaded(tmp_path: Path, run_one: Callable[..., str]):
+    """Whose bitcode is parsed only then: it is inlined as if both had been compiled."""
+    run_one()
+    changed = run_one(one=ONE.replace("return FACTOR", "return 1.0 + FACTOR"))
+    assert "8.0 Kept" in changed and "missing __main__.times" in changed
+    assert "ready other.third" in changed and "missing other.third" not in changed
 
 
 def test_the_fingerprint_is_of_what_is_named():
@@ -160,6 +170,37 @@ def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(
     assert f"7.0 {'Kept' if kept else 'Unkept'}" in said
     assert "missing __main__.times" in said and "ready __main__.times" in said
     assert any(tmp_path.glob("cache/*/*.nbi")) == kept
+
+
+READ_ONLY = """
+import errno, os, tempfile
+
+made = tempfile.TemporaryFile
+
+def refuse(dir):  # by which numba tries whether a folder may be written
+    if os.path.basename(dir) == "__pycache__":
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    return made(dir=dir)
+
+tempfile.TemporaryFile = refuse
+"""
+
+
+@pytest.mark.parametrize("home", [True, False])
+def test_what_was_compiled_when_it_was_installed_is_loaded_where_nothing_may_be_written(
+    tmp_path: Path, run_one: Callable[..., str], home: bool
+):
+    """A wheel that another user installed, or a container's image; with a home of one's own, and without."""
+    (nowhere := tmp_path / "file").touch()
+    where = {"cache": Path(), "HOME": str(nowhere), "XDG_CACHE_HOME": str(tmp_path / "home" if home else nowhere)}
+    assert "missing other.third" in run_one(**where)
+    assert any((tmp_path / "__pycache__").glob("*.nbi"))
+    installed = {**where, "one": READ_ONLY + ONE}
+    assert "missing other.third" not in run_one(**installed)
+    # Another program, which nobody compiled when it was installed.
+    assert "10.0 Kept" in run_one(3.0, **installed)
+    assert "missing" not in run_one(3.0, **installed)
+    assert any(tmp_path.glob("home/**/*.nbi")) == home
 
 
 def test_a_lock_waits_and_gives_up(tmp_path: Path):

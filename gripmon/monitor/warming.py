@@ -163,7 +163,7 @@ class _Work:
         self.compiles = True
         self._show = _shown(self._closing)
         kept: list[str] = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
-        if len(kept) < len(FUNCTIONS):
+        if len(kept) < len(FUNCTIONS) or not os.access(kept[0], os.W_OK):
             self.unkept = "no folder for it may be written"
             return
         wait = locked(
