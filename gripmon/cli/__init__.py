@@ -69,30 +69,30 @@ without --force."""
 
 _COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     "start": {
-        "setup": ("setup:setup", "from a camera to a running monitor, on one page"),
-        "demo": ("demo:demo", "the whole system on a simulated camera"),
-        "simulate": ("simulate:simulate", "write simulated images with exact truth"),
+        "setup": ("start:setup", "from a camera to a running monitor, on one page"),
+        "demo": ("start:demo", "the whole system on a simulated camera"),
+        "simulate": ("start:simulate", "write simulated images with exact truth"),
         "gripper": ("", "make a gripper file: from-cad, from-images"),
         "teach": ("teach:teach", "measure how the gripper's edges look at the reference"),
         "check": ("check:check", "validate a configuration and say what it will keep"),
     },
     "calibrate": {
-        "target": ("setup:target", "a calibration target to print"),
+        "target": ("start:target", "a calibration target to print"),
         "calibrate": ("", "calibrate from images: camera, hand/eye and more"),
     },
     "run": {
         "run": ("run:run", "the daemon: monitor a camera, publish and record"),
-        "send": ("send:send", "send a command to a running monitor: undo, accept, state, …"),
+        "send": ("run:send", "send a command to a running monitor: undo, accept, state, …"),
         "feed": ("network:feed", "publish images over Zenoh, as a camera's driver does"),
         "schema": ("network:schema", "print the JSON Schema of the messages"),
     },
     "look back": {
-        "report": ("recordings:report", "what happened: when did the camera move, what is affected"),
-        "view": ("recordings:view", "recordings in rerun's viewer, native or in a browser"),
-        "replay": ("replay:replay", "recorded images or a video through the monitor, JSON lines out"),
-        "correct": ("recordings:correct", "the best transform for every frame, from the whole recording"),
-        "export": ("recordings:export", "write recordings as Parquet, by robot and day"),
-        "dataset": ("dataset:dataset", "the extrinsics of every episode of a dataset"),
+        "report": ("look_back:report", "what happened: when did the camera move, what is affected"),
+        "view": ("look_back:view", "recordings in rerun's viewer, native or in a browser"),
+        "replay": ("look_back:replay", "recorded images or a video through the monitor, JSON lines out"),
+        "correct": ("look_back:correct", "the best transform for every frame, from the whole recording"),
+        "export": ("look_back:export", "write recordings as Parquet, by robot and day"),
+        "dataset": ("look_back:dataset", "the extrinsics of every episode of a dataset"),
     },
     "many robots": {
         "watch": ("watch:watch", "a live table of all monitors, or their alerts"),
@@ -119,8 +119,8 @@ _BELOW = {
     "gripper": (
         "way", _GRIPPER, None,
         {
-            "from-cad": ("gripper_cad:from_cad", "from STL, OBJ, PLY, DAE, URDF or .cao"),
-            "from-images": ("gripper_images:from_images", "from images before changing backgrounds"),
+            "from-cad": ("gripper:from_cad", "from STL, OBJ, PLY, DAE, URDF or .cao"),
+            "from-images": ("gripper:from_images", "from images before changing backgrounds"),
         },
     ),
 }  # fmt: skip
