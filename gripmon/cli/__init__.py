@@ -105,14 +105,14 @@ _BELOW = {
     "calibrate": (
         "method", _CALIBRATE, _CALIBRATE_EPILOG,
         {
-            "intrinsics": ("calibrate_intrinsics:intrinsics", "a camera from images of a flat target"),
-            "plane": ("calibrate_plane:plane", "camera to gripper, from images of it on a plate"),
+            "intrinsics": ("calibrate_images:intrinsics", "a camera from images of a flat target"),
+            "plane": ("calibrate_images:plane", "camera to gripper, from images of it on a plate"),
             "laser": ("calibrate_arm:laser", "a fixed camera, its plane and a laser pointer on the arm"),
             "robot-world": ("calibrate_arm:robot_world", "camera and arm, from poses of a target on the hand"),
-            "verify": ("calibrate_verify:verify", "do two calibrations differ, or does one still hold"),
-            "import": ("calibrate_exchange:import_", "a camera or a hand/eye transform from another program's file"),
+            "verify": ("calibrate_files:verify", "do two calibrations differ, or does one still hold"),
+            "import": ("calibrate_files:import_", "a camera or a hand/eye transform from another program's file"),
             "export": (
-                "calibrate_exchange:export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2"
+                "calibrate_files:export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2"
             ),
         },
     ),

@@ -156,6 +156,8 @@ class Kept(Watched, FunctionCache):
         super().__init__(py_func)  # type: ignore[no-untyped-call]
         made: Any = self._impl
         beside = _Installed(py_func, py_func.__code__.co_filename).get_cache_path()
+        self.keeps = not isinstance(made.locator, _Installed)
+        """Whether there is a folder to write to."""
         self._beside: Any = None
         if beside != self._cache_path:
             stamp = made.locator.get_source_stamp()
@@ -175,6 +177,8 @@ class Kept(Watched, FunctionCache):
         return found
 
     def _save(self, sig: Any, data: Any) -> None:
+        if not self.keeps:
+            return
         with self._index(fcntl.LOCK_EX):
             FunctionCache.save_overload(self, sig, data)  # type: ignore[no-untyped-call]
 

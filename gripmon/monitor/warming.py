@@ -158,8 +158,9 @@ class _Work:
     def _begin(self) -> None:
         self.compiles = True
         self._show = _shown(self._closing)
-        kept: list[str] = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
-        if len(kept) < len(FUNCTIONS) or not os.access(kept[0], os.W_OK):
+        caches = [made._cache for made in FUNCTIONS]
+        kept = [str(cache.cache_path) for cache in caches if isinstance(cache, Kept) and cache.keeps]
+        if len(kept) < len(FUNCTIONS):
             self.unkept = "no folder for it may be written"
             return
         wait = locked(
