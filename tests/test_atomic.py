@@ -18,7 +18,7 @@ OTHERWISE = {
     "cli/alert_log.py",
     "analyse/dataset.py",  # a temporary file that is renamed, and one that is only locked
     "daemon/starting.py",  # whether lines can be written there
-    "cli/replay.py",
+    "cli/look_back.py",
     "cli/common.py",
     "record/compared.py",  # a part that becomes the result
     "analyse/corrected.py",

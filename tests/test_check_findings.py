@@ -122,18 +122,6 @@ def test_jaw_travel_beyond_the_limit_is_a_warning_unless_the_jaws_stand(
     assert found["jaw travel"] == ("OK", "none: the opening is fixed at 34.0 mm")
 
 
-def test_the_columns_stand_however_long_the_names_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    text = (DEMO.parent / "grippers" / "two_box_fingers.yaml").read_text()
-    (tmp_path / "gripper.yaml").write_text(text.replace("L_in_near", "the_left_finger_inner_near"))
-    content = yaml.safe_load(DEMO.read_text()) | {"gripper": "gripper.yaml"}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
-    assert main(["check", str(tmp_path / "config.yaml"), "--verbose"]) == 0
-    out = capsys.readouterr().out.splitlines()
-    rows = [line for line in out if " px  " in line and ")" in line and "mm" in line and line.startswith(" " * 11)]
-    corners = [row for row in rows if row.lstrip().startswith(("L_", "R_", "the_"))]
-    assert len(corners) == 8 and len({row.index(" px  ") for row in corners}) == 1
-
-
 @pytest.mark.parametrize(("fy_px", "level"), [(965.0, "OK"), (505.0, "WARN")])
 def test_pixels_that_are_not_square_are_a_warning(
     fy_px: float, level: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

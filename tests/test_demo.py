@@ -137,7 +137,7 @@ def test_the_comparison_counts_by_hand():
 @pytest.mark.parametrize(("last", "slow"), [(11, False), (1187, True)])
 def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, slow: bool):
     """What the figures are worth comes before them, as after 27 of 1188 frames, in which no event was noticed."""
-    from gripmon.cli.demo import _as_text
+    from gripmon.cli.start import _as_text
 
     records = [record(seq, (0.0, 0.0, 0.0)) for seq in (*range(7), 9, last)]
     records += [record(seq, (0.0, 0.0, 0.0), source=Origin.HELD) for seq in (7, 8)]  # covered by the hand
@@ -154,7 +154,7 @@ def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, s
 
 
 def test_the_demo_names_what_there_is_to_ask(tmp_path: Path):
-    from gripmon.cli.demo import _report_line
+    from gripmon.cli.start import _report_line
 
     out = tmp_path / "a shift"
     asked = shlex.split(_report_line([str(out / "demo-0001.rrd"), str(out / "demo-0002.rrd")], out))

@@ -7,6 +7,7 @@ import fcntl
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from gripmon.model import compiled
 from gripmon.model.compiled import Watched, fingerprint, locked
 from gripmon.monitor import warm_up, warming
 
+ROOT = Path(__file__).resolve().parent.parent
 CLOCK = SimpleNamespace(now_s=0.0)
 
 
@@ -110,10 +112,12 @@ def third(x):
 def run_one(tmp_path: Path) -> Callable[..., str]:
     """Runs a program with a compiled function, a constant and a callee from another file; its standard output."""
 
-    def run(factor: float = 2.0, third: str = "x / 3.0", cache: Path = tmp_path / "cache", **more: str) -> str:
-        (tmp_path / "one.py").write_text(ONE)
+    def run(
+        factor: float = 2.0, third: str = "x / 3.0", cache: Path = tmp_path / "cache", one: str = ONE, **more: str
+    ) -> str:
+        (tmp_path / "one.py").write_text(one)
         (tmp_path / "other.py").write_text(OTHER.format(factor=factor, third=third))
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)} | more
+        environment = os.environ | {"NUMBA_CACHE_DIR": "" if cache == Path() else str(cache)} | more
         said = subprocess.run(
             [sys.executable, "-B", tmp_path / "one.py"], env=environment, capture_output=True, text=True, timeout=300
         )
@@ -133,6 +137,14 @@ def test_a_constant_of_another_file_is_noticed(run_one: Callable[..., str]):
 def test_a_callee_of_another_file_is_noticed(run_one: Callable[..., str]):
     run_one()
     assert "12.0 Kept" in run_one(third="2.0 * x")
+
+
+def test_a_caller_is_compiled_with_a_callee_that_was_loaded(tmp_path: Path, run_one: Callable[..., str]):
+    """Whose bitcode is parsed only then: it is inlined as if both had been compiled."""
+    run_one()
+    changed = run_one(one=ONE.replace("return FACTOR", "return 1.0 + FACTOR"))
+    assert "8.0 Kept" in changed and "missing __main__.times" in changed
+    assert "ready other.third" in changed and "missing other.third" not in changed
 
 
 def test_the_fingerprint_is_of_what_is_named():
@@ -162,6 +174,37 @@ def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(
     assert any(tmp_path.glob("cache/*/*.nbi")) == kept
 
 
+READ_ONLY = """
+import errno, os, tempfile
+
+made = tempfile.TemporaryFile
+
+def refuse(dir):  # by which numba tries whether a folder may be written
+    if os.path.basename(dir) == "__pycache__":
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    return made(dir=dir)
+
+tempfile.TemporaryFile = refuse
+"""
+
+
+@pytest.mark.parametrize("home", [True, False])
+def test_what_was_compiled_when_it_was_installed_is_loaded_where_nothing_may_be_written(
+    tmp_path: Path, run_one: Callable[..., str], home: bool
+):
+    """A wheel that another user installed, or a container's image; with a home of one's own, and without."""
+    (nowhere := tmp_path / "file").touch()
+    where = {"cache": Path(), "HOME": str(nowhere), "XDG_CACHE_HOME": str(tmp_path / "home" if home else nowhere)}
+    assert "missing other.third" in run_one(**where)
+    assert any((tmp_path / "__pycache__").glob("*.nbi"))
+    installed = {**where, "one": READ_ONLY + ONE}
+    assert "missing other.third" not in run_one(**installed)
+    # Another program, which nobody compiled when it was installed.
+    assert "10.0 Kept" in run_one(3.0, **installed)
+    assert ("missing __main__.times" in run_one(3.0, **installed)) is not home
+    assert any(tmp_path.glob("home/**/*.nbi")) == home
+
+
 def test_a_lock_waits_and_gives_up(tmp_path: Path):
     path, waits = tmp_path / "lock", []
     with locked(path, fcntl.LOCK_EX, 0.0) as first, locked(path, fcntl.LOCK_EX, 0.1, lambda: waits.append(1)) as second:
@@ -174,11 +217,9 @@ def test_a_lock_waits_and_gives_up(tmp_path: Path):
 
 HELPED = """
 import logging, sys
-from gripmon.judge import smoothing, stream
-from gripmon.model import poses
 from gripmon.monitor import warming
 
-warming.PARTS = {"averages": (smoothing.warm_up, stream.warm_up, poses.warm_up), "look": (warming.look.warm_up,)}
+warming.PARTS = {name: warming.PARTS[name] for name in ("averages", "drift")}
 warming._cores = lambda: 2
 logging.basicConfig(level=logging.INFO, stream=sys.stdout)
 warming.SAID_EVERY_S = 0.0
@@ -189,15 +230,18 @@ print("misses", sum(sum(f._cache_misses.values()) for f in warming.FUNCTIONS))
 
 @pytest.mark.slow("40; the other tests of this file, and that every run of the suite begins with this")
 def test_several_starts_at_once_compile_once_and_share_it(tmp_path: Path):
-    """Three programs at once on an empty cache: what each part needs is compiled by one of six processes."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    """Three programs at once, nothing compiled yet: what each part needs is compiled by one of six processes."""
+    shutil.copytree(ROOT / "gripmon", tmp_path / "gripmon", ignore=shutil.ignore_patterns("__pycache__"))
+    environment = os.environ | {"NUMBA_CACHE_DIR": "", "PYTHONPATH": str(tmp_path)}
     started = [
-        subprocess.Popen([sys.executable, "-c", HELPED], env=environment, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [sys.executable, "-c", HELPED], env=environment, stdout=subprocess.PIPE, text=True, cwd=tmp_path
+        )
         for _ in range(3)
     ]
     texts = [process.communicate(timeout=600)[0] for process in started]
     assert all(process.returncode == 0 for process in started)
-    assert any("now look.kernel.align" in text and "now judge.smoothing" in text for text in texts)
+    assert any("now drift.kernel" in text and "now judge.smoothing" in text for text in texts)
     first = [text for text in texts if "another process compiles the same" not in text]
     assert len(first) == 1
     for text in set(texts) - set(first):

@@ -1,52 +1,23 @@
-"""The command ``gripmon``: one declaration per subcommand, no heavy import before a subcommand runs.
+"""The command ``gripmon``: one declaration per subcommand; only the module of the one that runs is imported.
 
-It uses ``argparse``, which costs no import time; scripts rely on its error lines and exit codes.
+It uses ``argparse``, which costs little import time; scripts rely on its error lines and exit codes.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from gripmon import __version__
-from gripmon.cli import (
-    calibrate_arm,
-    calibrate_exchange,
-    calibrate_intrinsics,
-    calibrate_plane,
-    calibrate_verify,
-    check,
-    dataset,
-    demo,
-    gripper_cad,
-    gripper_images,
-    network,
-    recordings,
-    replay,
-    run,
-    send,
-    setup,
-    simulate,
-    teach,
-    watch,
-)
-from gripmon.cli.common import Arguments, Command
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_INTERRUPTED
 
-_COMMANDS = (
-    demo.demo, run.run, watch.watch, send.send, network.router, network.schema, network.feed, replay.replay,
-    recordings.view, recordings.report, recordings.export, recordings.correct, dataset.dataset,
-    simulate.simulate, check.check,
-)  # fmt: skip
-_METHODS = (
-    calibrate_intrinsics.intrinsics, calibrate_plane.plane, calibrate_arm.laser, calibrate_arm.robot_world,
-    calibrate_verify.verify, calibrate_exchange.import_, calibrate_exchange.export,
-)  # fmt: skip
-_WAYS = (gripper_cad.from_cad, gripper_images.from_images)
-_LAST = (setup.setup, setup.target, teach.teach)
+if TYPE_CHECKING:
+    from gripmon.cli.common import Arguments, Command
 
 _EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 
@@ -96,37 +67,112 @@ _GRIPPER = """\
 Make a gripper file from CAD or from images.  The file is written atomically, and none is replaced
 without --force."""
 
-_GROUPS = (
-    (
-        "calibrate",
-        "calibrate from images: camera, hand/eye and more",
-        _CALIBRATE,
-        _CALIBRATE_EPILOG,
-        "method",
-        _METHODS,
+_COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
+    "start": {
+        "setup": ("start:setup", "from a camera to a running monitor, on one page"),
+        "demo": ("start:demo", "the whole system on a simulated camera"),
+        "simulate": ("start:simulate", "write simulated images with exact truth"),
+        "gripper": ("", "make a gripper file: from-cad, from-images"),
+        "teach": ("teach:teach", "measure how the gripper's edges look at the reference"),
+        "check": ("check:check", "validate a configuration and say what it will keep"),
+    },
+    "calibrate": {
+        "target": ("start:target", "a calibration target to print"),
+        "calibrate": ("", "calibrate from images: camera, hand/eye and more"),
+    },
+    "run": {
+        "run": ("run:run", "the daemon: monitor a camera, publish and record"),
+        "send": ("run:send", "send a command to a running monitor: undo, accept, state, …"),
+        "feed": ("network:feed", "publish images over Zenoh, as a camera's driver does"),
+        "schema": ("network:schema", "print the JSON Schema of the messages"),
+    },
+    "look back": {
+        "report": ("look_back:report", "what happened: when did the camera move, what is affected"),
+        "view": ("look_back:view", "recordings in rerun's viewer, native or in a browser"),
+        "replay": ("look_back:replay", "recorded images or a video through the monitor, JSON lines out"),
+        "correct": ("look_back:correct", "the best transform for every frame, from the whole recording"),
+        "export": ("look_back:export", "write recordings as Parquet, by robot and day"),
+        "dataset": ("look_back:dataset", "the extrinsics of every episode of a dataset"),
+    },
+    "many robots": {
+        "watch": ("watch:watch", "a live table of all monitors, or their alerts"),
+        "router": ("network:router", "a Zenoh router between monitors and their readers"),
+    },
+}
+"""By what a person wants: each command with its module and name there, and what it is for."""
+
+_BELOW = {
+    "calibrate": (
+        "method", _CALIBRATE, _CALIBRATE_EPILOG,
+        {
+            "intrinsics": ("calibrate_images:intrinsics", "a camera from images of a flat target"),
+            "plane": ("calibrate_images:plane", "camera to gripper, from images of it on a plate"),
+            "laser": ("calibrate_arm:laser", "a fixed camera, its plane and a laser pointer on the arm"),
+            "robot-world": ("calibrate_arm:robot_world", "camera and arm, from poses of a target on the hand"),
+            "verify": ("calibrate_files:verify", "do two calibrations differ, or does one still hold"),
+            "import": ("calibrate_files:import_", "a camera or a hand/eye transform from another program's file"),
+            "export": (
+                "calibrate_files:export", "a calibration for ROS, Kalibr, OpenCV, mrcal, URDF, easy_handeye2"
+            ),
+        },
     ),
-    ("gripper", "make a gripper file", _GRIPPER, None, "way", _WAYS),
-)
+    "gripper": (
+        "way", _GRIPPER, None,
+        {
+            "from-cad": ("gripper:from_cad", "from STL, OBJ, PLY, DAE, URDF or .cao"),
+            "from-images": ("gripper:from_images", "from images before changing backgrounds"),
+        },
+    ),
+}  # fmt: skip
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all subcommands; each sets ``command``."""
+def build_parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """The parser, in which each command sets ``command``; ``words`` of a command line: with the arguments of the
+    command that they name alone, None: of all.
+    """
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=raw)
+    parser = _Parser(prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=raw)
     parser.add_argument("--version", action="version", version=f"gripmon {__version__}")
     parser.add_argument("--print-completion", action=_PrintCompletion, choices=("bash", "zsh"), help=argparse.SUPPRESS)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for command in _COMMANDS:
-        command.add_to(commands)
-    for name, summary, description, epilog, called, members in _GROUPS:
-        group = commands.add_parser(
-            name, help=summary, description=description, epilog=epilog, formatter_class=raw
-        ).add_subparsers(title=f"{called}s", metavar=called.upper(), required=True)
-        for member in members:
-            member.add_to(group)
-    for command in _LAST:
-        command.add_to(commands)
+    below = parser.add_subparsers(metavar="COMMAND", parser_class=argparse.ArgumentParser)
+    for commands in _COMMANDS.values():
+        _add_commands(below, commands, words)
     return parser
+
+
+def _add_commands(parent: Any, commands: dict[str, tuple[str, str]], words: Sequence[str] | None) -> None:
+    for name, (where, summary) in commands.items():
+        parser = parent.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if words is not None and words[:1] != [name]:
+            continue
+        if where:
+            module, _, named = where.partition(":")
+            command: Command = getattr(importlib.import_module(f"gripmon.cli.{module}"), named)
+            command.fill(parser)
+            continue
+        called, parser.description, parser.epilog, members = _BELOW[name]
+        group = parser.add_subparsers(title=f"{called}s", metavar=called.upper(), required=True)
+        _add_commands(group, members, None if words is None else words[1:])
+
+
+class _Parser(argparse.ArgumentParser):
+    """Its help lists the commands by what a person wants."""
+
+    def format_help(self) -> str:
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        (below,) = (action for action in self._actions if isinstance(action, argparse._SubParsersAction))
+        listed: dict[str, argparse.Action] = {each.dest: each for each in below._get_subactions()}
+        for title, commands in _COMMANDS.items():
+            formatter.start_section(title)
+            formatter.add_arguments([listed[name] for name in commands])
+            formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments([action for action in self._actions if action is not below])
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
 
 
 class _PrintCompletion(argparse.Action):
@@ -139,6 +185,7 @@ class _PrintCompletion(argparse.Action):
     ) -> None:
         import shtab
 
+        parser = build_parser()
         _complete_files(parser, shtab.FILE)
         print(shtab.complete(parser, str(value)))
         parser.exit()
@@ -156,8 +203,10 @@ def _complete_files(parser: argparse.ArgumentParser, files: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line (default: the process's own); return its exit code; wrong usage raises ``SystemExit(2)``."""
-    parser = build_parser()
-    chosen = parser.parse_args(arguments, Arguments())
+    words = sys.argv[1:] if arguments is None else arguments
+    named = [word for word in words if not word.startswith("-")]  # before a command no option has a value
+    parser = build_parser(named[:2])
+    chosen: Any = parser.parse_args(words, _arguments() if named else None)
     if not hasattr(chosen, "command"):
         parser.print_help()
         return 0
@@ -178,6 +227,12 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     return code
+
+
+def _arguments() -> Arguments:
+    from gripmon.cli.common import Arguments
+
+    return Arguments()
 
 
 def _in_words(error: InputError | NoResultError, arguments: Arguments) -> str:

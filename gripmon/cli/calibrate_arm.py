@@ -77,7 +77,7 @@ def _reach(text: str) -> float:
 
 
 @Command(
-    "laser", "a fixed camera, its plane and a laser pointer on the arm", _LASER_OPTIONS, _LASER_EXAMPLES,
+    _LASER_OPTIONS, _LASER_EXAMPLES,
     camera=REQUIRED, out=REQUIRED, arm_noise=arm_noise, reach=_reach,
     poses={"type": whole_number(1, 200, "isn't a number of poses; 1 to 200"), "default": 10},
 )  # fmt: skip
@@ -155,7 +155,7 @@ _TILTS = ("plane.tilt_a", "plane.tilt_b", "laser.turn_a", "laser.turn_b")
 
 
 @Command(
-    "robot-world", "camera and arm, from poses of a target on the hand", _ROBOT_WORLD_OPTIONS, _ROBOT_WORLD_EXAMPLES,
+    _ROBOT_WORLD_OPTIONS, _ROBOT_WORLD_EXAMPLES,
     out=REQUIRED,
 )  # fmt: skip
 def robot_world(arguments: Arguments) -> None:

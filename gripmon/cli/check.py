@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, check_text, sweep
+from gripmon.cli import render, sweep
 from gripmon.cli.common import Arguments, Command, arm_noise, positive_number, progress_bar
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
 --json          one JSON object instead of text; metres, radians, px
---verbose       the forecast in numbers
+--verbose       also the forecast in numbers, as --json has it, in mm and degrees
 --images INPUT  images of the gripper at the reference, a folder or a video, to run the monitor over (default: the
                 recorded source, else those that were taught from)
 --picture FILE  draw the first image with the edges that make the bounds as large (.png, .jpg)
@@ -52,11 +52,12 @@ names, or a missing package (one line says file, key, what is wrong, what would 
 says FAIL, such as a camera that can't be reached now; or something has moved since a laser calibration,
 or its spots are inconclusive"""
 
+_WAYS = ("beam and plane / ray and plane", "ray and plane / beam and ray", "beam / ray")
 _MOST = {"false_alarms": 10.0, "wrong_spots": 0.5}
 
 
 @Command(
-    "check", "validate a configuration and say what it will keep", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     {"sweep of camera mounts": (sweep.ABOUT, sweep.OPTIONS), "laser calibration": (_LASER, _LASER_OPTIONS)},
     arm_noise=arm_noise, false_alarms=positive_number, wrong_spots=positive_number,
 )  # fmt: skip
@@ -70,10 +71,10 @@ def check(arguments: Arguments) -> int:
     most.  Without images it is a forecast from the geometry, and says so: what stands behind the fingers isn't
     in it.
 
-    With --verbose, also the forecast: where the fingertip corners are in the image (px), which of them and
-    which edges are visible, the gripper's distance (mm), the accuracy of one frame along each axis, what the
-    view can't separate (an unknown jaw opening and the distance), whether its corners suffice to
-    recalibrate, how far camera and jaws may move until too little is in view.
+    With --verbose, also the forecast: where the fingertip corners are in the image, which of them and which
+    edges are visible, the accuracy of one frame along each axis, what the view can't separate (an unknown
+    jaw opening and the distance), whether its corners suffice to recalibrate, how far camera and jaws may
+    move until too little is in view.  The values are those of --json, under the same names.
 
     With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
     camera, plane and laser pointer fresh spots would detect, or which they show.
@@ -102,13 +103,8 @@ def _check(arguments: Arguments) -> int:
 
     arguments.check_outputs("picture")
     found = check_file(arguments.config[0], arguments.images)
-    if arguments.json:
-        _print_json({"findings": [each._asdict() for each in found.findings], **found.values()})
-    else:
-        lines = check_text.lines(str(arguments.config[0]), found.findings)
-        if arguments.verbose:
-            lines += ["", *check_text.details(found.forecast), *check_text.surrounding_lines(found.around)]
-        print("\n".join(lines))
+    values = {"findings": [each._asdict() for each in found.findings], **found.values()}
+    arguments.answer(values, _lines(values, verbose=arguments.verbose))
     if arguments.picture is not None:
         drawn = found.picture(arguments.picture.suffix)
         if drawn is None:
@@ -117,6 +113,18 @@ def _check(arguments: Arguments) -> int:
         if not arguments.json:
             print(f"picture: {arguments.picture}")
     return EXIT_FAILED if any(each.level == "FAIL" for each in found.findings) else EXIT_DONE
+
+
+def _lines(values: dict[str, Any], *, verbose: bool) -> list[str]:
+    """A headline, then a line a finding; with ``verbose`` all other values."""
+    findings, rest = values["findings"], {key: value for key, value in values.items() if key != "findings"}
+    parts = []
+    for level, what, none in (("FAIL", "failure", "sound"), ("WARN", "warning", "")):
+        count = sum(each["level"] == level for each in findings)
+        parts.append(f"{count} {what}{'s' * (count > 1)}" if count else none)
+    head = f"{values['config']}: {', '.join(filter(None, parts))}"
+    rows = render.columns([[*each.values()] for each in findings])
+    return [head, *rows, *(["", *render.lines(rest)] if verbose else [])]
 
 
 def _check_laser(arguments: Arguments) -> int:
@@ -129,12 +137,23 @@ def _check_laser(arguments: Arguments) -> int:
     calibration = _read_laser(path)
     if not arguments.config:
         report = expectation(str(path), calibration, settings)
-        _print_json(report) if arguments.json else print("\n".join(check_laser.expectation_lines(report)))
+        arguments.answer(report, render.lines(report))
         return EXIT_DONE
     found = judge(calibration, [Path(name) for name in arguments.config], settings, progress_bar)
     report = check_values(str(path), calibration, settings, found)
-    _print_json(report) if arguments.json else print("\n".join(check_laser.judged_lines(report)))
+    shown = {**report, "spots_judged": [_spot_row(each) for each in report["spots_judged"]]}
+    shown["verdict"] = f"{shown.pop('verdict')}: {shown.pop('text')}"  # last
+    arguments.answer(report, render.lines(shown))
     return EXIT_DONE if found.verdict == "same" else EXIT_FAILED
+
+
+def _spot_row(spot: dict[str, Any]) -> dict[str, Any]:
+    """How far a spot is off what was predicted, in the image, and by how much each two ways to it disagree."""
+    off_px = None if spot["off_px"] is None else math.hypot(*spot["off_px"])
+    row = {"spot": spot["name"], "off_px": off_px, "sigmas": spot["sigmas"], **dict.fromkeys(_WAYS)}
+    for gap in (gap for gap in spot["disagreements"] if " / ".join(gap["ways"]) in row):
+        row[" / ".join(gap["ways"])] = f"{1e3 * gap['distance_m']:.2f} mm ({math.sqrt(gap['square']):.1f} sigmas)"
+    return {**row, "reason": spot["reason"]}
 
 
 def _read_laser(path: Path) -> LaserCalibration:
@@ -165,7 +184,3 @@ def _watch_settings(arguments: Arguments) -> SpotWatchSettings:
         if value is not None:
             given["false_alarms_per_1000_pulses" if name == "false_alarms" else name] = value
     return SpotWatchSettings(**given)
-
-
-def _print_json(values: dict[str, Any]) -> None:
-    print(json.dumps(values, indent=2))

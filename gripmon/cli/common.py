@@ -1,13 +1,12 @@
 """Shared by all commands: their declaration, the files that they write, progress bars.
 
-No heavy imports at the top: this is imported for ``--help``.
+No heavy imports at the top: this is imported for a command's ``--help``.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
-import itertools
 import json
 import math
 import re
@@ -16,14 +15,10 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from gripmon.model.errors import InputError
 from gripmon.model.units import jaw_opening_in, jaw_range_in
-
-if TYPE_CHECKING:
-    from gripmon.model.provenance import Provenance
-    from gripmon.teach.result import GripperResult
 
 _T = TypeVar("_T")
 REQUIRED = {"required": True}
@@ -38,6 +33,11 @@ RESPONSE_OPTION = """
 --response          how grey levels follow the light: linear, srgb, or auto, as the images show it (default: auto)
 """
 RESPONSE = {"choices": ("auto", "linear", "srgb"), "default": "auto"}
+VIEW = {"nargs": "?", "const": "auto", "choices": ("auto", "web", "native", "server")}
+VIEW_OPTION = """
+--view  show it live in rerun's viewer, on this machine: native (a window), web (a page whose address is printed),
+        auto (native if there is a display), or server (only the stream that viewers connect to)
+"""
 _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -61,15 +61,13 @@ class Command:
 
     def __init__(
         self,
-        name: str,
-        summary: str,
         options: str,
         examples: str,
         groups: Mapping[str, tuple[str | None, str]] | None = None,
         /,
         **more: Any,
     ) -> None:
-        self._name, self._summary, self._epilog = name, summary, f"examples:\n{examples}"
+        self._epilog = f"examples:\n{examples}"
         self._tables, self._more = {"": (None, options), **(groups or {})}, more
         self.arguments: dict[str, str] = {}  # by name: the option, empty for a positional one
         self.defaults: dict[str, Any] = {}
@@ -83,12 +81,9 @@ class Command:
         """Run the command; return the exit code."""
         return self._handler(arguments) or 0
 
-    def add_to(self, commands: Any) -> None:
-        """Add the command below a parser."""
-        raw, description = argparse.RawDescriptionHelpFormatter, inspect.getdoc(self._handler)
-        parser: argparse.ArgumentParser = commands.add_parser(
-            self._name, help=self._summary, description=description, epilog=self._epilog, formatter_class=raw
-        )
+    def fill(self, parser: argparse.ArgumentParser) -> None:
+        """Make a parser that of this command."""
+        parser.description, parser.epilog = inspect.getdoc(self._handler), self._epilog
         parser.set_defaults(command=self)
         self.prog = parser.prog.partition(" ")[2]
         for title, (about, table) in self._tables.items():
@@ -231,19 +226,6 @@ class Arguments(argparse.Namespace):
                 from gripmon.daemon.calibrations import write_document
 
                 write_document(made, path)
-
-    def save_gripper(self, made: GripperResult, provenance: Provenance, **taken: list[str]) -> None:
-        """Write what the options name of a gripper, its file, reference and picture, and print its summary, after what
-        was ``taken``: lines by their keys in JSON.
-        """
-        self.save("out", made.text().encode())
-        if getattr(self, "reference_out", None) is not None:
-            self.save("reference_out", made.reference(provenance))
-        self.save("picture", made.picture)
-        paths = (getattr(self, name, None) for name in ("out", "reference_out", "picture"))
-        written = [str(path) for path in paths if path is not None]
-        lines = [*itertools.chain(*taken.values()), *made.summary(), *(f"written: {each}" for each in written)]
-        self.answer({**made.values(), **taken, "written": written}, lines)
 
 
 def _option(name: str) -> str:

@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gripmon.cli.render import columns
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -68,9 +70,7 @@ def summary(statuses: Sequence[MonitorStatus], fault: str) -> str:
 
 def plain(statuses: Sequence[MonitorStatus], fault: str) -> str:
     """Aligned columns without colours."""
-    lines = [COLUMNS, *(row(status).cells for status in statuses)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    table = ["  ".join(c.ljust(width) for c, width in zip(cells, widths, strict=True)).rstrip() for cells in lines]
+    table = columns([COLUMNS, *(row(status).cells for status in statuses)])
     legend = [LEGEND] if any(status.alerts for status in statuses) else []
     return "\n".join([*table, summary(statuses, fault), *legend])
 

@@ -53,7 +53,7 @@ _LOOK_EVERY_S = 1.0
 
 
 @Command(
-    "feed", "publish images over Zenoh, as a camera's driver does", _FEED_OPTIONS, _FEED_EXAMPLES, robot=REQUIRED,
+    _FEED_OPTIONS, _FEED_EXAMPLES, robot=REQUIRED,
     camera={"default": "wrist"}, format={"choices": ("raw", "jpeg", "png"), "default": "raw"},
     quality={"type": whole_number(1, 100, "isn't a quality; a whole number, 1 to 100"), "default": 90},
     fps=positive_number,
@@ -101,7 +101,7 @@ def feed(arguments: Arguments) -> int:
 
 
 @Command(
-    "router", "a Zenoh router between monitors and their readers", "FILE  Zenoh configuration (json5, yaml)",
+    "FILE  Zenoh configuration (json5, yaml)",
     _ROUTER_EXAMPLES,
 )  # fmt: skip
 def router(arguments: Arguments) -> None:
@@ -142,7 +142,7 @@ _SCHEMA_OPTIONS = f"""
 
 
 @Command(
-    "schema", "print the JSON Schema of the messages", _SCHEMA_OPTIONS, _SCHEMA_EXAMPLES,
+    _SCHEMA_OPTIONS, _SCHEMA_EXAMPLES,
     message={"choices": _MESSAGES},
 )  # fmt: skip
 def schema(arguments: Arguments) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from gripmon.cli import render
 from gripmon.cli.common import Arguments, progress_bar, two_numbers
 from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE
@@ -60,97 +60,70 @@ def run(arguments: Arguments) -> int:
 
 
 _SHOWN, _REASONS_SHOWN = 8, 4
-_COLUMNS = (
-    ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
-    ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 8),
-    ("bound", "mm", 8), ("detects", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
-)  # fmt: skip
+_ABOUT = """\
+corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible; sigma: one frame's
+TCP at the usual opening; worst: along its least certain direction, at the worst opening; bound: on its error at the
+worst opening, compared with alert_limit_m; detects: the smallest step detected along every axis; frames: until one of
+warn_m is; margin: corners to the image's border; shift: of the camera sideways until too little is in view.  Not
+included: focus, light, obstacles, and what hides the fingers without being in the gripper file."""
+_NO_FACES = """\
+The gripper file has none, like an inferred one: every edge counts as visible from everywhere, even if the finger \
+itself hides it.  Trust only mounts near the present one."""
 
 
 def _as_text(config: Config, swept: Sweep) -> list[str]:
-    """A table for a person: mm, degrees."""
-    at_px, present, ranked = swept.tcp_at_px, swept.present, swept.mounts
-    working = sum(trial.works for trial in ranked)
-    lines = [
-        f"{config.path}: {len(ranked)} mounts tried, {working} would work",
-        f"TCP        at ({at_px[0]:.1f}, {at_px[1]:.1f}) px in all of them",
-        *_looked_at(config, present),
-        " " * 10 + "".join(title.rjust(width) for title, _, width in _COLUMNS),
-        " " * 10 + "".join(unit.rjust(width) for _, unit, width in _COLUMNS),
-    ]
-    lines += [
-        f"{'best' if k == 0 and trial.works else '':<10}{_row(trial)}"
-        for k, trial in enumerate(ranked[:_SHOWN])
-    ]
-    place = sum(trial.rank < present.rank for trial in ranked)
-    lines.append(f"{'present':<10}{_row(present)}")
-    better = f"{place} of those tried are" if place else "none of those tried is"
-    lines.append(f"           {better} better than the present one")
-    lines += [f"           present: {fault.text}" for fault in present.faults]
-    lines += _failing(ranked)
-    lines += [
-        "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
-        "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
-        "           worst opening; bound: on its error at the worst opening, compared with alert_limit_m;",
-        "           detects: the smallest step detected along every axis; in: frames until",
-        f"           one of {1e3 * swept.warn_m:g} mm is; margin: corners to the image's border; shift: of the camera",
-        "           sideways until too little is in view.  Not included: focus, light, obstacles, and what hides the",
-        "           fingers without being in the gripper file.",
-    ]
+    """The best mounts and the present one as a table."""
+    present, ranked = swept.present, swept.mounts
+    better = sum(trial.rank < present.rank for trial in ranked)
+    notes: dict[str, Any] = {"tcp_at_px": swept.tcp_at_px, **_looked_at(config, present.jaw.opening_m)}
+    notes["present"] = f"{better or 'none'} of those tried {'are' if better > 1 else 'is'} better"
     if not config.gripper.faces:
-        lines += [
-            "no faces   The gripper file has none, like an inferred one: every edge counts as visible from everywhere,",
-            "           even if the finger itself hides it. Trust only mounts near the present one.",
-        ]
-    if ranked[0].works:
-        lines += _to_copy(ranked[0])
-    return lines
+        notes["no_faces"] = _NO_FACES
+    reasons = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
+    if reasons:
+        notes["others"] = [f"{count} would not work: {kind}" for kind, count in reasons]
+    rows = [_row("present", present), *(_row(str(k + 1), trial) for k, trial in enumerate(ranked[:_SHOWN]))]
+    head = f"{config.path}: {len(ranked)} mounts tried, {sum(trial.works for trial in ranked)} would work"
+    best = _to_copy(ranked[0]) if ranked[0].works else ()
+    return [head, *render.table(rows), *_ABOUT.splitlines(), *render.lines(notes), *best]
 
 
-def _looked_at(config: Config, present: Trial) -> list[str]:
+def _looked_at(config: Config, openings_m: Sequence[float]) -> dict[str, str]:
     """Which openings count, and how taught edges are used."""
-    lines = []
-    low_mm, high_mm = 1e3 * present.jaw.opening_m[0], 1e3 * present.jaw.opening_m[-1]
-    if high_mm > low_mm:
+    notes = {}
+    if openings_m[-1] > openings_m[0]:
         usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
-        lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
+        span = f"{1e3 * openings_m[0]:.1f} to {1e3 * openings_m[-1]:.1f} mm of opening"
+        notes["jaw"] = f"{span}, {usual}; --jaw MIN:MAX for a part of it"
     if config.taught is not None:
-        lines.append("taught     at the present mount; teaching again at another mount is more accurate there")
+        notes["taught"] = "at the present mount; teaching again at another mount is more accurate there"
     elif config.gripper.edge_bevel_m[~config.gripper.edge_curved].any():
-        lines.append("taught     not yet: the gripper file's bevels count as taught; until they are, bounds are wider")
-    return lines
+        notes["taught"] = "not yet: the gripper file's bevels count as taught; until they are, bounds are wider"
+    return notes
 
 
-def _row(trial: Trial) -> str:
-    angles = (math.degrees(v) for v in (trial.tilt_rad, trial.side_rad, trial.roll_rad))
-    cells = [f"{1e3 * trial.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{trial.focal_px:.0f}"]
-    cells += [str(min(trial.jaw.corners)), str(min(trial.jaw.edges)), f"{100.0 * trial.jaw.share:.0f}"]
+def _row(rank: str, trial: Trial) -> dict[str, Any]:
     frame, promises = trial.accuracy, trial.promises
+    row = {"rank": rank, **{key: getattr(trial, key) for key in _OF_MOUNT}}
+    row |= {"corners": min(trial.jaw.corners), "edges": min(trial.jaw.edges), "travel %": 100.0 * trial.jaw.share}
+    found: dict[str, Any] = dict.fromkeys(
+        ("sigma_m", "worst_m", "bound_m", "detects_m", "frames", "margin_px", "shift_m")
+    )
     if frame is not None and frame.expected is not None and promises is not None:
-        cells += [_number(v, 1e3, 3) for v in frame.expected.tcp_m]
-        cells += [_number(v, 1e3, 3) for v in (trial.worst_sigma_m, promises.sizes.median_m, trial.noticed_m)]
-        cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
-        cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
-    row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))
-    return row if trial.works else f"{row}  NO: {trial.faults[0].text}"
+        values = (
+            frame.expected.tcp_m, trial.worst_sigma_m, promises.sizes.median_m, trial.noticed_m,
+            "never" if trial.delay_frames is None else trial.delay_frames, trial.margin_px, trial.shift_m,
+        )  # fmt: skip
+        found = dict(zip(found, values, strict=True))
+    return {**row, **found, "works": trial.works or f"NO: {trial.faults[0].text}"}
 
 
-def _number(value: float | None, factor: float, digits: int) -> str:
-    scaled = math.inf if value is None else factor * value
-    return f"{scaled:.{digits if abs(scaled) < 10.0 or digits < 2 else 1}f}"
-
-
-def _failing(ranked: Sequence[Trial]) -> list[str]:
-    """The most common first reasons."""
-    kinds = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
-    return [f"{'' if k else 'others':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(kinds)]
+_OF_MOUNT = ("distance_m", "tilt_rad", "side_rad", "roll_rad", "focal_px")
 
 
 def _to_copy(best: Trial) -> list[str]:
-    transform = best.cam_T_grip
-    return [
-        "best as    reference:",
-        "             cam_T_grip:",
-        f"               translation_m: [{', '.join(f'{v:.6f}' for v in transform.translation_m)}]",
-        f"               rotation_xyzw: [{', '.join(f'{v:.6f}' for v in transform.rotation_xyzw)}]",
-    ]
+    turn = {key: ", ".join(f"{v:.6f}" for v in getattr(best.cam_T_grip, key)) for key in _TRANSFORM}
+    return ["best as", "  reference:", "    cam_T_grip:", *(f"      {key}: [{text}]" for key, text in turn.items())]
+
+
+_TRANSFORM = ("translation_m", "rotation_xyzw")

@@ -95,7 +95,7 @@ def _key(text: str) -> str:
 
 
 @Command(
-    "teach", "measure how the gripper's edges look at the reference", _OPTIONS, _EXAMPLES,
+    _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)}, jaw_opening=positive_number, live_wait=positive_number, robot=_key,
     camera_name=_key, jaw_source={"choices": ("fixed", "frames", "zenoh")}, port=PAGE_PORT, response=RESPONSE,
     distance=length,

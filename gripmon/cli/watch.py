@@ -61,7 +61,7 @@ _ALERT_PERIOD_S = 0.2
 
 
 @Command(
-    "watch", "a live table of all monitors, or their alerts", _OPTIONS, _EXAMPLES, {"the page": (None, _PAGE)},
+    _OPTIONS, _EXAMPLES, {"the page": (None, _PAGE)},
     period=positive_number, seconds=positive_number, port=PAGE_PORT,
 )  # fmt: skip
 def watch(arguments: Arguments) -> None:

@@ -1,8 +1,9 @@
 """Machine code, by numba, for the per-frame arithmetic.
 
 Numba keeps compiled code beside the sources, in the user's cache or in ``NUMBA_CACHE_DIR``, and notices changes in a
-function's own file.  What else is compiled into it, the constants and functions that it names, belongs to the key here,
-so that a changed constant of another file is noticed.  Several processes may compile and load at once.
+function's own file.  What is kept beside the sources is loaded also where nothing may be written.  What else is
+compiled into a function, the constants and functions that it names, belongs to the key here, so that a changed constant
+of another file is noticed.  Several processes may compile and load at once.
 
 Assigning an array to a slice is avoided: for its error message numba compiles the joining of texts, which takes longer
 than the function (3 of 54 s of processor time for the first one).
@@ -22,7 +23,16 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache, NullCache
+from llvmlite import binding as llvm
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+    _CacheLocator,
+    _SourceFileBackedLocatorMixin,
+)
+from numba.core.codegen import JITCodeLibrary
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -30,6 +40,9 @@ FUNCTIONS: list[Any] = []
 """Every compiled function of the modules that were imported."""
 
 _INDEX_PATIENCE_S = 5.0  # its holder writes a few kB; one that was stopped meanwhile holds up nobody for good
+
+
+_NO_BITCODE = llvm.parse_assembly("").as_bitcode()
 
 
 class Watcher(Protocol):
@@ -78,6 +91,57 @@ class Unkept(Watched, NullCache):
         self._py_func = py_func
 
 
+class _Loaded(JITCodeLibrary):
+    """Machine code that was loaded.  Its bitcode, which only a caller that is compiled later needs, is parsed for the
+    first such caller: of a monitor that takes 2 of 5 parts of the time to load, and 25 MB for as long as it runs.
+    """
+
+    _bitcode = b""
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        name, kind, (code, bitcode) = state
+        made: Any = super()._unserialize(codegen, (name, kind, (code, _NO_BITCODE)))  # type: ignore[no-untyped-call]
+        made._shared_module, made._bitcode = None, bitcode
+        return made
+
+    def _get_module_for_linking(self) -> Any:
+        if self._bitcode:
+            codegen: Any = self._codegen
+            self._shared_module = llvm.parse_bitcode(self._bitcode)
+            codegen._engine._load_defined_symbols(self._shared_module)
+            self._bitcode = b""
+        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]
+
+
+class _Installed(_SourceFileBackedLocatorMixin, _CacheLocator):
+    """Beside the sources, where somebody else may have compiled when the program was installed."""
+
+    def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
+        self._py_file, self._lineno = py_file, py_func.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        return str(Path(self._py_file).parent / "__pycache__")
+
+    def ensure_cache_path(self) -> None:
+        if not Path(self.get_cache_path()).is_dir():
+            raise FileNotFoundError(self.get_cache_path())
+
+
+class _LoadedByNeed(CompileResultCacheImpl):
+    _locator_classes = [*CompileResultCacheImpl._locator_classes, _Installed]  # noqa: RUF012
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """Called with numba's compiler locked."""
+        codegen, (_, function, *_) = target_context.codegen(), payload
+        codegen._engine._defined_symbols |= {function.llvm_func_name, function.llvm_cpython_wrapper_name}
+        codegen._library_class = _Loaded
+        try:
+            return super().rebuild(target_context, payload)  # type: ignore[no-untyped-call]
+        finally:
+            del codegen._library_class
+
+
 class Kept(Watched, FunctionCache):
     """Numba's cache with constants in its key, in which index and code of a function change together.
 
@@ -85,14 +149,36 @@ class Kept(Watched, FunctionCache):
     reads meanwhile would take older code for the new.
     """
 
+    _impl_class = _LoadedByNeed
+
+    def __init__(self, py_func: Callable[..., Any]) -> None:
+        """Raises RuntimeError or OSError where there is neither a folder to write to nor one beside the sources."""
+        super().__init__(py_func)  # type: ignore[no-untyped-call]
+        made: Any = self._impl
+        beside = _Installed(py_func, py_func.__code__.co_filename).get_cache_path()
+        self.keeps = not isinstance(made.locator, _Installed)
+        """Whether there is a folder to write to."""
+        self._beside: Any = None
+        if beside != self._cache_path:
+            stamp = made.locator.get_source_stamp()
+            self._beside = IndexDataCacheFile(beside, made.filename_base, stamp)  # type: ignore[no-untyped-call]
+
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return *super()._index_key(sig, codegen), fingerprint(self._py_func)  # type: ignore[no-untyped-call]
 
     def _load(self, sig: Any, target_context: Any) -> Any:
         with self._index(fcntl.LOCK_SH):
-            return FunctionCache.load_overload(self, sig, target_context)  # type: ignore[no-untyped-call]
+            found = FunctionCache.load_overload(self, sig, target_context)  # type: ignore[no-untyped-call]
+        if found is None and self._beside is not None:
+            key = self._index_key(sig, target_context.codegen())
+            with contextlib.suppress(OSError):
+                data = self._beside.load(key)
+                found = None if data is None else self._impl.rebuild(target_context, data)
+        return found
 
     def _save(self, sig: Any, data: Any) -> None:
+        if not self.keeps:
+            return
         with self._index(fcntl.LOCK_EX):
             FunctionCache.save_overload(self, sig, data)  # type: ignore[no-untyped-call]
 
@@ -110,8 +196,8 @@ def compiled(function: _F) -> _F:
         return function
     made: Any = numba.njit(error_model="numpy")(function)
     try:
-        made._cache = Kept(function)  # type: ignore[no-untyped-call]
-    except (RuntimeError, OSError):  # no folder for the cache: every start compiles
+        made._cache = Kept(function)
+    except (RuntimeError, OSError):  # every start compiles
         made._cache = Unkept(function)
     FUNCTIONS.append(made)
     return cast("_F", made)

@@ -50,6 +50,19 @@ def chi_square_limit(chance: float, dimensions: int = 6) -> float:
     return float(chdtri(dimensions, chance))
 
 
+def joint_weight(covariance: Array) -> Array:
+    """Inverse of a covariance (n d, n d), also where each d numbers have one of their own: (n, d, d).
+
+    Not by ``scipy.linalg.block_diag``: importing it takes 0.05 s and 7 MB of every monitor.
+    """
+    if covariance.ndim == 2:
+        return np.asarray(np.linalg.inv(covariance))
+    count, size = covariance.shape[:2]
+    weight = np.zeros((count, size, count, size))
+    weight[range(count), :, range(count)] = np.linalg.inv(covariance)
+    return weight.reshape(count * size, count * size)
+
+
 CONTRADICTION_SQUARE = chi_square_limit(1e-5)
 """Gate for six numbers that should agree: noise exceeds it once in 100,000 frames, the default integrity risk."""
 

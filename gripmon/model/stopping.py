@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import signal
 import threading
@@ -58,7 +57,9 @@ def end_with_parent() -> None:
     """In a worker that :mod:`multiprocessing` spawned: exit when the parent ends, even if it was killed by SIGKILL or
     for lack of memory.  Otherwise the worker would wait for work forever and keep all of its memory.
     """
-    parent = multiprocessing.parent_process()
+    from multiprocessing import parent_process  # heavy, and the command line imports this module
+
+    parent = parent_process()
     assert parent is not None, "only a spawned process has a parent to follow"
 
     def follow() -> None:

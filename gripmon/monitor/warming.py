@@ -6,18 +6,20 @@ import contextlib
 import fcntl
 import logging
 import os
-import subprocess
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from gripmon.judge import drift, repeats, smoothing, stream
 from gripmon.model import poses
 from gripmon.model.compiled import FUNCTIONS, Kept, Watched, locked
+from gripmon.model.own_process import OwnProcess
 from gripmon.track import edges, integrity
 
 _log = logging.getLogger(__name__)
@@ -44,11 +46,6 @@ SAID_EVERY_S = 10.0
 ANOTHER_TAKES_S = 600.0
 """How long another process that compiles the same is waited for (s): longer than the slowest known, which took 451."""
 
-_HOME = str(Path(__file__).resolve().parents[2])
-_BOOTSTRAP = (
-    "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
-    "from gripmon.monitor.warming import help_compiling; help_compiling()"
-)
 _DONE = "done"
 
 
@@ -76,14 +73,15 @@ def warm_up() -> str:
     return f"{text}; the next start loads it"
 
 
-def help_compiling() -> None:
-    """Entry point of a helping process: names of parts on standard input; on standard output what becomes of which
-    function, and "done" after each part.
+def help_compiling(descriptor: int) -> None:
+    """In a helping process, until the other end closes: it is sent names of parts, and sends what becomes of which
+    function, and ``_DONE`` after each part.
     """
-    Watched.watcher = _Told()
-    for line in sys.stdin:
-        _warm(line.strip())
-        _say(_DONE)
+    with contextlib.suppress(EOFError, OSError), Connection(descriptor) as told:
+        Watched.watcher = _Told(told)
+        while True:
+            _warm(told.recv())
+            told.send((_DONE, ""))
 
 
 def _warm(part: str) -> str:
@@ -100,20 +98,18 @@ def _warm(part: str) -> str:
     return unkept
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
-
-
 class _Told:
     """Tells the process that is helped."""
 
+    def __init__(self, told: Connection[Any, Any]) -> None:
+        self._told = told
+
     def missing(self, name: str) -> bool:
-        _say(f"missing {name}")
+        self._told.send(("missing", name))
         return False
 
     def ready(self, name: str) -> None:
-        _say(f"ready {name}")
+        self._told.send(("ready", name))
 
 
 class _Work:
@@ -162,7 +158,8 @@ class _Work:
     def _begin(self) -> None:
         self.compiles = True
         self._show = _shown(self._closing)
-        kept: list[str] = [made._cache.cache_path for made in FUNCTIONS if isinstance(made._cache, Kept)]
+        caches = [made._cache for made in FUNCTIONS]
+        kept = [str(cache.cache_path) for cache in caches if isinstance(cache, Kept) and cache.keeps]
         if len(kept) < len(FUNCTIONS):
             self.unkept = "no folder for it may be written"
             return
@@ -178,22 +175,15 @@ class _Work:
 
     def _be_helped(self) -> None:
         """Let a process of its own take parts; one that fails leaves them to :func:`warm_up`'s second round."""
-        with contextlib.suppress(OSError, ValueError):
-            process: Any = subprocess.Popen(
-                [sys.executable, "-P", "-c", _BOOTSTRAP, _HOME], text=True, bufsize=1, start_new_session=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
-            self._closing.callback(process.kill)
-            with process:
-                while (part := self.next_part()) is not None:
-                    process.stdin.write(f"{part}\n")
-                    for line in process.stdout:
-                        what, _, name = line.strip().partition(" ")
-                        if what == _DONE:
-                            break
-                        self._tell(name, ready=what == "ready")
-                    else:
-                        return
+        ours, theirs = Pipe()
+        with contextlib.suppress(OSError, EOFError), ours:
+            with theirs:
+                process = OwnProcess(help_compiling, theirs.fileno(), inherits=(theirs.fileno(),), quiet=True)
+            self._closing.callback(process.end)
+            while (part := self.next_part()) is not None:
+                ours.send(part)
+                while (said := ours.recv())[0] != _DONE:
+                    self._tell(said[1], ready=said[0] == "ready")
 
 
 def _cores() -> int:

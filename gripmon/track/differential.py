@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from gripmon.model.geometry import exp_rotation, log_rotation, skew
 from gripmon.model.gripper import on_a_line
+from gripmon.model.least_squares import joint_weight
 from gripmon.model.records import Array
 
 
@@ -61,7 +61,7 @@ def differential_update(
     if on_a_line(points_cam_m):
         raise DegenerateGeometry("the corners lie on a line, or nearly so")
     rotation, tcp = np.eye(3), tcp_cam_m.copy()
-    weight_xy = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
+    weight_xy = joint_weight(covariance_xy)
     for _ in range(iterations):
         points = (points_cam_m - tcp_cam_m) @ rotation.T + tcp
         rows, sides = equation_17(points, measured_xy)

@@ -86,6 +86,7 @@ PARTS = {
     "demo": Part("gripmon demo", "program.demo"),
     "replay": Part("replay of a folder, decoding aside", "program.replay", (("quiet", False), *_CLUTTER)),
     "start": Part("from the start of gripmon run to its first transform", "program.start", _CLUTTER),
+    "memory": Part("gripmon run above its libraries alone", "program.memory", _CLUTTER),
     "commands": Part("gripmon --help, import gripmon", "program.commands"),
     "profile": Part("time of each stage of a frame", "loop.profile", (*_CLUTTER, ("hidden", False))),
 }

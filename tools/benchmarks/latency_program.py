@@ -33,10 +33,11 @@ from gripmon.io.sources import Waiting
 from gripmon.io.sources.realtime import SimulatedCamera
 from gripmon.model.records import Frame
 
-OF_A_CORE, REPLAYED_PER_S, START_S, HELP_S, IMPORT_S = 12.0, 800.0, 3.0, 0.3, 0.2
+OF_A_CORE, REPLAYED_PER_S, START_S, HELP_S, IMPORT_S, ABOVE_MB = 12.0, 800.0, 1.5, 0.1, 0.2, 100.0
 _BEGIN_S = 2.0
 """Of the daemon's run, before the loop's time counts."""
 _START_WITHIN_S = 120.0  # the first start may compile
+_LIBRARIES = "numba, cv2, scipy, zenoh"
 _GRIPMON = (sys.executable, "-m", "gripmon")
 
 
@@ -244,26 +245,68 @@ def _timed_decoding(times_s: list[float]) -> Iterator[None]:
 
 def start(paths: tuple[Path, ...], plan: Plan) -> Measured:
     """``gripmon run`` on a camera on the network that is there already, until its first transform has arrived."""
-    took_s = []
-    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch, _Camera(paths[0]) as camera:
-        network = {"mode": "peer", "listen": [], "connect": [camera.endpoint]}
-        config = write_config(Path(scratch), camera.size, source={"kind": "zenoh"}, publish=network)
-        for number in range(plan.starts + 1):
-            command = [*_GRIPMON, "run", str(config), "--out", str(Path(scratch) / str(number))]
-            camera.transform.clear()
+    took_s, used_s = [], []
+    with _Camera(paths[0]) as camera:
+        for _ in range(plan.starts + 1):
             start_s = time.monotonic()
-            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            try:
-                if not camera.transform.wait(_START_WITHIN_S):
-                    raise RuntimeError("no transform came")
+            with _running(camera) as process:
                 took_s.append(camera.first_s - start_s)
-            finally:
-                process.send_signal(signal.SIGINT)
-                process.wait(30.0)
+                used_s.append(_processor_s(process.pid))
     first_s, later_s = took_s[0], took_s[1:]
     note = f"first start {first_s:.3g} s; later ones {min(later_s):.3g} to {max(later_s):.3g} s"
     row = Row("gripmon run until its first transform, machine code cached", statistics.median(later_s), "s", START_S)
-    return Measured((dataclasses.replace(row, note=note),))
+    used = Row("the same, processor time of its process", statistics.median(used_s[1:]), "s")
+    return Measured((dataclasses.replace(row, note=note), used))
+
+
+def memory(paths: tuple[Path, ...], plan: Plan) -> Measured:
+    """What the libraries take alone, and ``gripmon run`` with a camera on the network above it; its recording aside."""
+    waiting = f"import {_LIBRARIES}; print(flush=True); input()"
+    command = [sys.executable, "-c", waiting]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as libraries:
+        assert libraries.stdout is not None
+        libraries.stdout.readline()
+        alone = _resident_mb(libraries.pid)
+        libraries.communicate("\n")
+    with _Camera(paths[0]) as camera, _running(camera) as process:
+        time.sleep(plan.daemon_s)
+        whole = _resident_mb(process.pid)
+    rows = [
+        Row(f"gripmon run above import {_LIBRARIES}, {name}", whole[key] - alone[key], "MB", ABOVE_MB,
+            note=f"{whole[key]:.0f} MB, the libraries alone {alone[key]:.0f} MB")
+        for key, name in (("Rss", "resident"), ("Pss", "resident, shared pages by share"))
+    ]  # fmt: skip
+    return Measured(tuple(rows), (f"after {plan.daemon_s:g} s at {scene.FPS:g} frames/s",))
+
+
+@contextlib.contextmanager
+def _running(camera: _Camera) -> Iterator[subprocess.Popen[bytes]]:
+    """``gripmon run`` of a camera, with recording, once its first transform has arrived."""
+    camera.transform.clear()
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
+        network = {"mode": "peer", "listen": [], "connect": [camera.endpoint]}
+        config = write_config(Path(scratch), camera.size, source={"kind": "zenoh"}, publish=network)
+        command = [*_GRIPMON, "run", str(config), "--out", str(Path(scratch) / "out")]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            if not camera.transform.wait(_START_WITHIN_S):
+                raise RuntimeError("no transform came")
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(30.0)
+
+
+def _resident_mb(pid: int) -> dict[str, float]:
+    """``Rss``, and ``Pss`` with what several processes share counted by their number."""
+    rows = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]
+    return {row.split(":")[0]: 1.024e-3 * float(row.split()[1]) for row in rows}
+
+
+def _processor_s(pid: int) -> float:
+    """Of all threads of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
 
 
 class _Camera:

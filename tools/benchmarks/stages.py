@@ -51,7 +51,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
         (Policy, "measured"),
     ),
     "make the record": ((gripmon.monitor.core, "measured_record"),),
-    "encode and publish": ((ZenohPublisher, "transform"),),
+    "encode and publish": ((ZenohPublisher, "frame"),),
     "learn the gripper's look, after publishing": ((Integrity, "learn"),),
     "the rest of the loop": ((Daemon, "_handle"),),
 }

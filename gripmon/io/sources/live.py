@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, Protocol
 import msgspec
 
 from gripmon.io.sources.base import SourceError, Waiting
-from gripmon.io.sources.http_jpegs import HttpJpegs
 from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.queued import Backlog
 from gripmon.model.records import Frame, Image
@@ -206,6 +205,8 @@ class _CaptureReader:
         settings = self._settings
         stream: _Stream | None = None
         if is_http(settings):
+            from gripmon.io.sources.http_jpegs import HttpJpegs  # http and ssl: 0.02 s
+
             try:
                 stream = HttpJpegs.open(str(settings.device), settings.open_timeout_s, settings.read_timeout_s)
             except OSError as error:

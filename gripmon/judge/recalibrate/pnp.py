@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.linalg import block_diag
 
 from gripmon.model.geometry import make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import on_a_line
+from gripmon.model.least_squares import joint_weight
 from gripmon.model.records import Array
 
 FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
@@ -68,7 +68,7 @@ def solutions(
     if why is not None:
         raise RecalibrationRefused(why)
     starts = _closed_forms(points_grip_m, measured_xy, coplanar(points_grip_m))
-    weight_xy: Array = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
+    weight_xy = joint_weight(covariance_xy)
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
     sound = sorted((r for r in refined if r is not None), key=lambda r: r.weighted_rms)
     different: list[Recalibration] = []
