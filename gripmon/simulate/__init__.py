@@ -4,9 +4,8 @@ from gripmon.simulate.bodies import FrameTruth, Hidden
 from gripmon.simulate.builtin import DEFAULT_FPS, SCENARIO_NAMES, make_scenario
 from gripmon.simulate.calibration_images import KINDS as CALIBRATION_KINDS
 from gripmon.simulate.calibration_images import image_count, write_calibration_images
-from gripmon.simulate.rig import PAPER_LENS, Rig, paper_cam_T_grip, paper_rig
 from gripmon.simulate.scenario import Scenario
-from gripmon.simulate.sequence import Simulator, write_sequence
+from gripmon.simulate.sequence import PAPER_LENS, Rig, Simulator, paper_cam_T_grip, paper_rig, write_sequence
 
 __all__ = [
     "CALIBRATION_KINDS",

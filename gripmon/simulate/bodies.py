@@ -212,21 +212,6 @@ class FrameTruth:
             {"id": name, "uv_px": uv.tolist() if np.isfinite(uv).all() else None, "hidden": hidden}
             for name, uv, hidden in zip(self.corner_ids, self.corner_uv_px, self.hidden, strict=True)
         ]
-        return msgspec.json.encode(
-            {
-                "index": self.index,
-                "file": file,
-                "time_s": self.time_s,
-                "stamp_ns": self.stamp_ns,
-                "cam_T_grip": self.cam_T_grip.tolist(),
-                "reference_cam_T_grip": self.reference_cam_T_grip.tolist(),
-                "tcp_shift_m": self.tcp_shift_m.tolist(),
-                "jaw_opening_m": self.jaw_opening_m,
-                "jaw_reported_m": self.jaw_reported_m,
-                "corners": corners,
-                "finger_bend": self.finger_bend.tolist(),
-                "events": self.events,
-                "exposure": self.exposure,
-                "defocus_px": self.defocus_px,
-            }
-        )
+        of_corners = ("corner_ids", "corner_uv_px", "hidden")
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in of_corners}
+        return msgspec.json.encode({"file": file, **values, "corners": corners}, enc_hook=np.ndarray.tolist)

@@ -27,9 +27,8 @@ from gripmon.simulate.coverage import RayGrid
 from gripmon.simulate.disturbance import SensorModel
 from gripmon.simulate.laser import cluttered, paper_cell, pixels_of, poses_on_plane, spot_image
 from gripmon.simulate.plates import Plate, PlateBackdrop, facing
-from gripmon.simulate.rig import Rig
 from gripmon.simulate.scenario import JawScript, Scenario, Sensor
-from gripmon.simulate.sequence import PNG_COMPRESSION
+from gripmon.simulate.sequence import PNG_COMPRESSION, Rig
 
 PLATE = CircleGrid(12, 10, 0.008, 0.004)
 """Mostly light, so that dark fingers stand out in front of it."""
@@ -58,9 +57,7 @@ Progress = Callable[[], None]
 
 def image_count(kind: str) -> int:
     """Number of images of a kind of :data:`KINDS`."""
-    return {"plate": _FREE_VIEWS + _FINGER_VIEWS, "standing": _STANDING, "robot_world": _ROBOT_POSES}.get(
-        kind, 10 * _ORIENTATIONS + 1 + _FREE_VIEWS + _FINGER_VIEWS
-    )
+    return _WRITERS[kind][1]
 
 
 def write_calibration_images(
@@ -69,7 +66,8 @@ def write_calibration_images(
     """Write a kind of :data:`KINDS` into an existing folder.  ``progress`` is called after each image.  OSError if a
     file can't be written, ValueError for an unsuitable gripper: no closed convex fingers, or jaws without tips.
     """
-    _WRITERS[kind](_Folder(out_dir, progress), rig, seed)
+    write, _ = _WRITERS[kind]
+    write(_Folder(out_dir, progress), rig, seed)
 
 
 class _Folder:
@@ -211,12 +209,13 @@ def _spots(folder: _Folder, rig: Rig, seed: int) -> None:
     )  # fmt: skip
 
 
-_WRITERS: dict[str, Callable[[_Folder, Rig, int], None]] = {
-    "plate": _plate,
-    "standing": _standing,
-    "robot_world": _robot_world,
-    "spots": _spots,
+_WRITERS: dict[str, tuple[Callable[[_Folder, Rig, int], None], int]] = {
+    "plate": (_plate, _FREE_VIEWS + _FINGER_VIEWS),
+    "standing": (_standing, _STANDING),
+    "robot_world": (_robot_world, _ROBOT_POSES),
+    "spots": (_spots, _FREE_VIEWS + _FINGER_VIEWS + 1 + 10 * _ORIENTATIONS),
 }
+"""What writes a kind, and how many images it writes."""
 KINDS = tuple(_WRITERS)
 
 

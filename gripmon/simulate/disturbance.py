@@ -17,7 +17,6 @@ from gripmon.model.records import Array
 from gripmon.simulate.coverage import CELL_PX, RayGrid, enlarge_cells
 from gripmon.simulate.scenario import (
     Bump,
-    Cover,
     Creep,
     Defocus,
     FingerLook,
@@ -157,11 +156,6 @@ def prop_offset_m(script: Prop, t_s: float) -> Array | None:
     here = pulse(t_s, script.start_s, script.end_s, script.move_s)
     sway = math.sin(2.0 * math.pi * script.sway_hz * t_s)
     return (1.0 - here) * np.array(script.from_m) + sway * np.array(script.sway_m)
-
-
-def cover_share(script: Cover, t_s: float) -> float:
-    """How far a cover has moved in, 0 (outside the view) to 1."""
-    return pulse(t_s, script.start_s, script.end_s, script.move_s)
 
 
 def defocus_sigma_px(scripts: tuple[Defocus, ...], t_s: float) -> float:

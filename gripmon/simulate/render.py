@@ -8,6 +8,7 @@ the lamp's direction, times a texture fixed to the face.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -227,18 +228,18 @@ class Painter:
         for face, bevel in enumerate(solid.bevel):
             level = gain * look.level_dn * self._shade(solid, face) * (look.bevel_gain if bevel else 1.0)
             body_T_plane, rows, columns, px_per_m = self._sheet(solid, face)
-            texture = None
+            factors = []
             if look.texture > 0.0:
-                texture = textures.metal(self._rng, rows, columns, px_per_m, look.texture)
-                texture = level * self._foreshortened(texture, body_T_plane, px_per_m)
+                brushed = textures.metal(self._rng, rows, columns, px_per_m, look.texture)
+                factors.append(self._foreshortened(brushed, body_T_plane, px_per_m))
             if look.highlights > 0.0:
-                matt = np.full((rows, columns), level, np.float32) if texture is None else texture
-                texture = matt * textures.streak(self._rng, columns, look.highlights)
+                factors.append(textures.streak(self._rng, columns, look.highlights))
             marks = [] if bevel else [mark for mark in own if mark.shape != "whole"]
             if marks:
-                plain = np.full((rows, columns), level, np.float32) if texture is None else texture
                 grid = textures.grid_m(rows, columns, px_per_m, body_T_plane)
-                texture = plain * textures.marks(marks, solid, face, grid, px_per_m)
+                factors.append(textures.marks(marks, solid, face, grid, px_per_m))
+            even = np.full((rows, columns), level, np.float32)
+            texture = functools.reduce(np.multiply, factors, even) if factors else None
             surfaces.append(Surface(level, texture, px_per_m, body_T_plane, self._normal_cam(solid, face)))
         return tuple(surfaces)
 

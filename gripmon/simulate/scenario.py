@@ -328,12 +328,6 @@ class Pairs(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     tcp_shift_m: tuple[Length, Length]
     tcp_shift_sigma_m: Annotated[float, Meta(ge=0.0, le=0.05, description="along each axis of the shift (m)")] = 2e-4
-    rotation_sigma_deg: Annotated[
-        float, Meta(ge=0.0, le=20.0, description="scatter of the calibrations, each axis (degrees)")
-    ] = 1.0
-    translation_sigma_m: Annotated[
-        float, Meta(ge=0.0, le=0.05, description="scatter of the calibrations, each axis (m)")
-    ] = 2e-3
 
 
 class Scenario(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -16,6 +16,7 @@ from gripmon.simulate import disturbance
 from gripmon.simulate.scenario import BentFinger, MountMotion, Scenario
 
 _TIP_SHARE = 0.1  # fraction of a finger's length that counts as its tip, and as its root
+_SCATTER_RAD, _SCATTER_M = math.radians(1.0), 2e-3  # of the calibrations of pairs, standard deviation of each axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,7 @@ class Scene:
             held = scenario.grasped.arrive_s[1] <= time_s <= scenario.grasped.leave_s[0]
             labels.append("object_between" if held else "object_moves")
         labels += ["prop" for p in scenario.props if p.start_s <= time_s < p.end_s]
-        labels += [c.kind for c in scenario.covers if disturbance.cover_share(c, time_s) > 0.0]
+        labels += [c.kind for c in scenario.covers if disturbance.pulse(time_s, c.start_s, c.end_s, c.move_s) > 0.0]
         labels += ["light_step" for s in scenario.light.steps if 0.0 <= time_s - s.at_s < 1.0]
         labels += ["shadow" for s in scenario.light.shadows if s.start_s < time_s < s.end_s]
         if disturbance.defocus_sigma_px(scenario.defocus, time_s) > 0.0:
@@ -123,9 +124,9 @@ class Scene:
         assert pairs is not None
         rng = np.random.default_rng([self._seed, 2, frame // 2])
         shift = np.array(pairs.tcp_shift_m) + rng.normal(0.0, pairs.tcp_shift_sigma_m, 2)
-        turn = exp_rotation(rng.normal(0.0, math.radians(pairs.rotation_sigma_deg), 3))
+        turn = exp_rotation(rng.normal(0.0, _SCATTER_RAD, 3))
         reference = make_transform(
-            turn @ self._nominal[:3, :3], self._nominal[:3, 3] + rng.normal(0.0, pairs.translation_sigma_m, 3)
+            turn @ self._nominal[:3, :3], self._nominal[:3, 3] + rng.normal(0.0, _SCATTER_M, 3)
         )
         if frame % 2 == 0:
             return reference, None
@@ -164,7 +165,7 @@ class Scene:
         """Covers in view with the poses of their frames: x points to where they come from, the leading side is -x."""
         out = []
         for index, cover in enumerate(self._scenario.covers):
-            share = disturbance.cover_share(cover, time_s)
+            share = disturbance.pulse(time_s, cover.start_s, cover.end_s, cover.move_s)  # how far it has moved in
             if share > 0.0:
                 turn = {"right": 0.0, "bottom": 0.5, "left": 1.0, "top": 1.5}[cover.side] * math.pi
                 c, s = round(math.cos(turn)), round(math.sin(turn))

@@ -1,15 +1,22 @@
-"""The simulator: frame i of a scenario with its truth, for any i in any order; also images and truth as files."""
+"""Where every simulated image comes from: a rig, of a camera, its gripper and where that is, and what happens to it.
+
+The simulator gives frame i of a scenario with its truth, for any i in any order; also images and truth as files.
+"""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
+from gripmon.model.camera import Camera, LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import make_transform
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Frame
 from gripmon.simulate import disturbance
@@ -19,30 +26,58 @@ from gripmon.simulate.render import Backdrop, Renderer
 from gripmon.simulate.scenario import Scenario
 from gripmon.simulate.scene import Scene, SceneState
 
+PAPER_LENS = PaperLens(
+    width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
+)
+"""That of the self-viewing paper, and of what was measured with others."""
+
+
+def paper_cam_T_grip(tilt_deg: float = 32.0, tcp_m: tuple[float, float, float] = (0.0004, 0.0013, 0.115)) -> Array:
+    """Pose (4, 4) of a gripper tilted about the camera's x axis, as in the paper."""
+    c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
+    return make_transform(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]), np.array(tcp_m))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A wrist camera, its gripper, and ``cam_T_grip`` (4, 4) before any disturbance."""
+
+    camera: Camera
+    gripper: Gripper
+    cam_T_grip: Array
+
+    @property
+    def jaw_opening_m(self) -> float:
+        """Nearly fully open, so that the fingers are near the image's borders and leave a plate visible; nominal for
+        a gripper without a jaw.
+        """
+        low, high = self.gripper.jaw_min_m, self.gripper.jaw_max_m
+        return low + 5.0 / 6.0 * (high - low) if self.gripper.has_jaw else self.gripper.jaw_nominal_m
+
+    def simulator(self, scenario: Scenario, seed: int = 0, backdrop: Backdrop | None = None) -> Simulator:
+        """The frames of a scenario and their truth: see :class:`Simulator`."""
+        return Simulator(self, scenario, seed, backdrop)
+
+
+def paper_rig(gripper: Gripper, cam_T_grip: Array | None = None, lens: LensSettings = PAPER_LENS) -> Rig:
+    """A gripper before the paper's camera, at :func:`paper_cam_T_grip` if no pose is given."""
+    return Rig(make_camera(lens), gripper, paper_cam_T_grip() if cam_T_grip is None else cam_T_grip)
+
 
 class Simulator:
     """A wrist camera that sees its own fingertips.
 
-    Frame i is a pure function of camera, gripper, calibration, scenario, seed and i.  Not thread-safe.  Raises
-    ValueError if the scenario doesn't fit the gripper, or the gripper has no closed convex fingers.  ``backdrop``
-    replaces the scenario's table, for example by a calibration plate.
+    Frame i is a pure function of rig, scenario, seed and i.  Not thread-safe.  Raises ValueError if the scenario
+    doesn't fit the gripper, or the gripper has no closed convex fingers.  ``backdrop`` replaces the scenario's table,
+    for example by a calibration plate.
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        gripper: Gripper,
-        nominal_cam_T_grip: Array,
-        scenario: Scenario,
-        seed: int = 0,
-        backdrop: Backdrop | None = None,
-    ) -> None:
-        self._backdrop = backdrop
-        self.camera, self.gripper, self.scenario, self.seed = camera, gripper, scenario, seed
-        self.nominal_cam_T_grip = np.array(nominal_cam_T_grip, dtype=float)
-        self._scene = Scene(camera, gripper, self.nominal_cam_T_grip, scenario, seed)
-        self.bodies = Bodies(gripper, scenario, self._scene.view_half[1])
-        self._painting: tuple[Renderer, SensorModel] | None = None
+    def __init__(self, rig: Rig, scenario: Scenario, seed: int = 0, backdrop: Backdrop | None = None) -> None:
+        self.rig, self.scenario, self.seed, self._backdrop = rig, scenario, seed, backdrop
+        self.camera, self.gripper = rig.camera, rig.gripper
+        self.nominal_cam_T_grip = np.array(rig.cam_T_grip, dtype=float)
+        self._scene = Scene(rig.camera, rig.gripper, self.nominal_cam_T_grip, scenario, seed)
+        self.bodies = Bodies(rig.gripper, scenario, self._scene.view_half[1])
 
     @property
     def frame_count(self) -> int:
@@ -93,22 +128,21 @@ class Simulator:
 
     def light(self, index: int) -> NDArray[np.float32]:
         """Light on the sensor (height, width) of a frame in DN at exposure 1, before vignetting, exposure and noise."""
-        renderer, _ = self._painters()
-        return renderer.render(self.time_s(index))
+        return self.renderer.render(self.time_s(index))
 
     def expose(self, light: NDArray[np.float32], index: int) -> NDArray[np.uint8]:
         """Image of a frame from the light on the sensor, which is overwritten: from :meth:`light`, or modified."""
-        _, sensor = self._painters()
-        return sensor.expose(light, index, self.time_s(index))
+        return self._sensor.expose(light, index, self.time_s(index))
 
-    def _painters(self) -> tuple[Renderer, SensorModel]:
-        """Renderer and sensor, created for the first image: truth needs neither."""
-        if self._painting is None:
-            scenario, nominal = self.scenario, self.nominal_cam_T_grip
-            backdrop = self._backdrop
-            renderer = Renderer(self.camera, self.bodies, self._scene, scenario, nominal, self.seed, backdrop)
-            self._painting = renderer, SensorModel(renderer.rays, scenario, self.seed)
-        return self._painting
+    @functools.cached_property
+    def renderer(self) -> Renderer:
+        """What draws, made for the first image: truth doesn't need it."""
+        nominal = self.nominal_cam_T_grip
+        return Renderer(self.camera, self.bodies, self._scene, self.scenario, nominal, self.seed, self._backdrop)
+
+    @functools.cached_property
+    def _sensor(self) -> SensorModel:
+        return SensorModel(self.renderer.rays, self.scenario, self.seed)
 
     def frame(self, index: int) -> Frame:
         """A frame as a camera would deliver it, with the jaw opening that the robot reports."""

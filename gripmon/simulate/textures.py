@@ -30,15 +30,8 @@ _SCRATCH_PX = 8
 """Around a scratch: its blur of 0.6 px (sigma) reaches 3 px."""
 
 
-def even(height_px: int, width_px: int) -> Factor:
-    """A uniform surface."""
-    return np.ones((height_px, width_px), np.float32)
-
-
 def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: float) -> Factor:
     """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is roughly their contrast."""
-    if strength == 0.0:
-        return even(height_px, width_px)
     out, generator = _metal(json.dumps(rng.bit_generator.state), height_px, width_px, px_per_m, strength)
     rng.bit_generator.state = json.loads(generator)
     return out
@@ -340,7 +333,7 @@ def marks(wanted: list[FingerMark], solid: Solid, face: int, grid: Array, px_per
 def lines(rng: Rng, look: ObjectLook, solid: Solid, grid: Array, px_per_m: float) -> Factor:
     """Factor of a line pattern on one face of an object; equal on all faces for the same random state."""
     if look.pattern == "plain":
-        return even(*grid.shape[:2])
+        return np.ones(grid.shape[:2], np.float32)
     # On a face without extent along the fingers, a line parallel to the tips has a position along y.
     beyond = 2 if np.ptp(grid[..., 2]) > _FLAT_M else 1
     if look.pattern == "fold":

@@ -69,9 +69,8 @@ def _rendered(
 
 def coverage(simulator: Simulator) -> NDArray[np.float32]:
     """Part of each pixel that the gripper hides, as blurred as the lens makes it."""
-    renderer, _ = simulator._painters()
     passes = np.ones((simulator.camera.height_px, simulator.camera.width_px), np.float32)
-    for layer in renderer._body_layers(simulator._scene.at(0.0)):
+    for layer in simulator.renderer._body_layers(simulator._scene.at(0.0)):
         passes[layer.window] *= layer.passes
     return 1.0 - passes
 

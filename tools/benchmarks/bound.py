@@ -27,7 +27,6 @@ from benchmarks.accuracy_runs import Track
 from benchmarks.scenes import Scene
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array
-from gripmon.simulate import Rig
 from gripmon.simulate.scenario import JawScript, Tilt
 
 BOUND_ROW = "standing"
@@ -135,7 +134,7 @@ def _opened(scene: Scene, more_m: float) -> Array:
 def _picture(scene: Scene, scenario: Any) -> Array:
     """The light of the second frame: at time zero, nothing has happened yet."""
     own = scene.simulator
-    return Rig(own.camera, own.gripper, own.nominal_cam_T_grip).simulator(scenario, own.seed).light(1).astype(float)
+    return own.rig.simulator(scenario, own.seed).light(1).astype(float)
 
 
 def repeatability(track: Track, bounds: list[Bound]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from gripmon.daemon.calibrations import write_document
 from gripmon.model.geometry import from_record, perturb, to_record
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Origin, Verdict
-from gripmon.simulate import Rig, Scenario
+from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import JawScript, Light
 
 FRAMES, STILLS = 180, 15
@@ -64,9 +64,8 @@ def _take_images(scene: IntegrityScene, seed: int, stills: int, folder: Path) ->
     images = folder / "images"
     images.mkdir(parents=True)
     lines = ["file,stamp_ns,jaw_opening_m"]
-    rig = Rig(shown.camera, shown.gripper, pose)
     for part, opening_m in enumerate((float(shown.frame(0).jaw_opening_m or 0.0), GRASPED_M)):
-        still = rig.simulator(_at_rest(shown.scenario, opening_m), seed + part)
+        still = shown.rig.simulator(_at_rest(shown.scenario, opening_m), seed + part)
         for k in range(stills):
             name = f"{part}_{k:02d}.png"
             cv2.imwrite(str(images / name), still.render(k))

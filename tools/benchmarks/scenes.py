@@ -122,7 +122,7 @@ class Scene(Sequence):
         """The same scene with a frame each millisecond; only its truth is asked for."""
         own = self.simulator
         fast = msgspec.structs.replace(own.scenario, fps=1e3)
-        return Rig(own.camera, own.gripper, own.nominal_cam_T_grip).simulator(fast, own.seed)
+        return own.rig.simulator(fast, own.seed)
 
 
 def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Scene:
