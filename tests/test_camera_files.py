@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from support.camera_texts import COLMAP, KALIBR, OPENICC, ORB2, ORB3, OST, REALSENSE, STEREO, VINS
+from support.foreign_files import read_camera
 
-from gripmon.calibrate.camera_files import LARGEST_TANGENTIAL, read_camera
+from gripmon.calibrate.camera_files import LARGEST_TANGENTIAL
 from gripmon.calibrate.foreign import InterchangeError
 from gripmon.cli import main
 from gripmon.daemon.calibrations import camera_in
@@ -263,7 +264,7 @@ def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: py
 
     for name in ("read_bytes", "read_text"):
         monkeypatch.setattr(Path, name, forbidden)
-    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); a readable YAML file"):
+    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); the path of a YAML file"):
         read_any_camera(path)
 
 

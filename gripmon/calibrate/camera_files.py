@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gripmon.calibrate.camera_formats import READ, ROS_MESSAGE, FileLens, cameras_in, of_message
+from gripmon.calibrate.camera_formats import ROS_MESSAGE, FileLens, cameras_in, of_message
 from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 
@@ -33,19 +33,19 @@ class ForeignCamera:
 
 
 def read_camera(
-    data: bytes,
-    file: str,
+    document: Document,
     *,
     which: str | None = None,
     size_px: tuple[int, int] | None = None,
     model: LensModel | None = None,
 ) -> ForeignCamera:
-    """The camera in a file's bytes.  Options for what a file may leave open: ``which`` of several cameras, the image's
+    """The camera in a file.  Options for what a file may leave open: ``which`` of several cameras, the image's
     size, and the lens's model, which also overrules a file that calls a fisheye ``plumb_bob``.
     :class:`InterchangeError` for a file that holds none, for one that no monitor can use, and for one that leaves open
     what no option says.
     """
-    kind, cameras = cameras_in(Document(file, data, READ))
+    file = document.file
+    kind, cameras = cameras_in(document)
     if which is None and len(cameras) > 1:
         raise InterchangeError(
             file, "", f"holds {len(cameras)} cameras", f"gripmon calibrate import with --camera {' or '.join(cameras)}"
