@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from gripmon.calibrate.bundle import GivenCamera, independent_errors, lens_vector
+from gripmon.calibrate.bundle import GivenCamera, independent_errors
 from gripmon.calibrate.documents import CalibratedGripper
+from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
