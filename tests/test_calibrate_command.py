@@ -15,8 +15,8 @@ import pytest
 import yaml
 from support.plates import Look, fingers, pose, render
 
-from gripmon.calibrate.bundle import lens_vector
 from gripmon.calibrate.documents import CameraCalibration
+from gripmon.calibrate.lens_models import lens_vector
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.targets import target_of

@@ -11,11 +11,14 @@ from scipy.stats import chi2
 from support.sightings import CAMERAS, PLATE_M, poses, seen
 
 from gripmon.calibrate import api, bundle
-from gripmon.calibrate.bundle import MODELS, lens_vector, plate_pose
-from gripmon.calibrate.intrinsics import calibrate, calibrate_best, calibrate_single_view, cross_validate, doubts_of
-from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.bundle import plate_pose
+from gripmon.calibrate.cross_validation import cross_validate
+from gripmon.calibrate.intrinsics import calibrate, calibrate_best, calibrate_single_view, doubts_of
+from gripmon.calibrate.lens_models import MODELS, lens_vector
+from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import exp_rotation, log_rotation
+from gripmon.model.targets import TargetError
 
 BROWN = CAMERAS["brown_conrady"]
 
@@ -152,6 +155,26 @@ def test_where_half_of_the_views_contradict_nobody_knows_which_half(monkeypatch:
     assert tried == [6, 5, 4]  # of six, three left out are half
 
 
+@pytest.mark.parametrize("anchored", [False, True])
+def test_a_board_that_is_described_too_large_is_refused_where_an_image_shows_its_ends(
+    anchored: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """The other images show as many points, whose ends may be hidden; one that shows the whole of what was described
+    says that it is right.
+    """
+    rng = np.random.default_rng(5)
+    views: list[object] = [*seen(BROWN, poses(rng, 5), rng, anchored=anchored)]
+    views[2] = NotFound("the target shows 6 x 4 inner corners; it should have 7 x 5", smaller=True)
+    monkeypatch.setattr(api, "images_of_one_camera", lambda _: [(f"{k}.png", k) for k in range(5)])
+    monkeypatch.setattr(api, "detect", lambda image, _target, _name: views[image])
+    if anchored:
+        assert len(api.calibrate_intrinsics(list("abcde"), "chequerboard:9x7:0.02").sightings) == 4
+        return
+    said = r"1 of 5 images show a smaller one whole, none this one \(2.png: the target shows 6 x 4 inner"
+    with pytest.raises(TargetError, match=said):
+        api.calibrate_intrinsics(list("abcde"), "chequerboard:9x7:0.02")
+
+
 @pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_5"])
 def test_views_that_determine_nothing_end_after_a_bounded_effort(model: str, monkeypatch: pytest.MonkeyPatch):
     """A set like this one was given up after 254 s."""
@@ -206,11 +229,11 @@ def test_cross_validation_measures_what_the_noise_is():
     rng = np.random.default_rng(17)
     views = seen(BROWN, poses(rng, 10), rng, noise_px=0.1)
     steps: list[int] = []
-    crossed = cross_validate(views, "brown_conrady", step=lambda: steps.append(1))
+    crossed = cross_validate(views, "brown_conrady", step=lambda: steps.append(1)).rms_px
     # A pose of its own takes 6 of a view's some hundred coordinates.
     assert crossed == pytest.approx(0.1, rel=0.08) and len(steps) == 5
     assert crossed > 0.999 * calibrate(views, "brown_conrady").rms_px
-    assert cross_validate(views[:3], "brown_conrady") is None
+    assert cross_validate(views[:3], "brown_conrady").rms_px is None
 
 
 def test_what_is_fixed_stays():
@@ -279,6 +302,7 @@ def test_views_are_doubted_from_stated_limits_on(reach: float, lost: int, rms_sh
     uv_px = np.array([320.0, 240.0]) + np.linspace(0.0, 400.0 * reach, 100)[:, None] * [0.8, 0.6]
     sighting = Sighting(uv_px, np.zeros((100, 3)), np.tile(np.eye(2), (100, 1, 1)), np.arange(100), (640, 480))
     result = SimpleNamespace(
+        target=None,
         camera=SimpleNamespace(width_px=640, height_px=480, fx_px=700.0),
         values={},
         parameters=(),

@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from support.camera_texts import COLMAP, KALIBR, OPENICC, ORB2, ORB3, OST, REALSENSE, STEREO, VINS
+from support.foreign_files import read_camera
 
-from gripmon.calibrate.camera_files import LARGEST_TANGENTIAL, read_camera
+from gripmon.calibrate.camera_files import LARGEST_TANGENTIAL
 from gripmon.calibrate.foreign import InterchangeError
 from gripmon.cli import main
 from gripmon.daemon.calibrations import camera_in
@@ -226,6 +227,53 @@ def test_realsense_without_distortion_needs_no_model_that_is_opencv_s():
     assert read_camera(as_yaml, "x", size_px=(640, 480)).camera.fx_px == 600.5
 
 
+STREAMS = """\
+Device info:
+    Name                          : \tIntel RealSense D435
+Intrinsic Parameters:
+
+ Intrinsic of "Depth" / 1280x720 / {Z16}
+  Width:      \t1280
+  Height:     \t720
+  PPX:        \t639.5
+  PPY:        \t360.25
+  Fx:         \t640.5
+  Fy:         \t640.5
+  Distortion: \tBrown Conrady
+  Coeffs:     \t0  \t0  \t0  \t0  \t0  \n  FOV (deg):  \t89.97 x 58.69
+
+ Intrinsic of "Color" / 1280x720 / {YUYV/RGB8/BGR8}
+  Width:      \t1280
+  Height:     \t720
+  PPX:        \t640.591186523438
+  PPY:        \t365.166442871094
+  Fx:         \t927.6630859375
+  Fy:         \t927.691650390625
+  Distortion: \tInverse Brown Conrady
+  Coeffs:     \t0  \t0  \t0  \t0  \t0  \n  FOV (deg):  \t69.2 x 42.42
+
+Motion Intrinsic Parameters:
+"""
+
+
+def test_what_rs_enumerate_devices_prints_is_a_camera_s_file():
+    again = STREAMS[STREAMS.index(' Intrinsic of "Color"') :].replace("RGB8/BGR8", "Y16")
+    for text in (STREAMS, STREAMS + again, STREAMS.replace("\n", "\r\n")):  # a stream stands there once a format
+        found = read_camera(text.encode(), "x", which="Color/1280x720")
+        assert found.kind == "realsense" and (found.camera.width_px, found.camera.height_px) == (1280, 720)
+        assert (found.camera.fx_px, found.camera.cy_px) == (927.6630859375, 365.166442871094)
+        assert not any(found.camera.coefficients)
+    with pytest.raises(InterchangeError, match=r"holds 2 cameras; .* --camera Depth/1280x720 or Color/1280x720"):
+        read_camera(STREAMS.encode(), "x")
+    other = read_camera((STREAMS + again.replace("927.66", "900.66")).encode(), "x", which="Color/1280x720/YUYV/Y16")
+    assert other.camera.fx_px == 900.6630859375
+    with pytest.raises(InterchangeError, match=r"Color/1280x720: model: inverse_brown_conrady isn't OpenCV's lens"):
+        read_camera(STREAMS.replace("\t0  \t0", "\t0.1  \t0").encode(), "x", which="Color/1280x720")
+    sizes = [STREAMS.replace("1280x720", f"{n}x{n}") for n in (240, 424, 480, 640)]
+    with pytest.raises(InterchangeError, match=r"holds 8 cameras; .* Color/240x240 or .*Depth/424x424 or …$"):
+        read_camera("".join(sizes).encode(), "x")
+
+
 def test_every_command_takes_the_file_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The readers behind --camera, --lens, a configuration's camera, verify and export are these two."""
     color = json.dumps(REALSENSE["color"])
@@ -263,7 +311,7 @@ def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: py
 
     for name in ("read_bytes", "read_text"):
         monkeypatch.setattr(Path, name, forbidden)
-    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); a readable YAML file"):
+    with pytest.raises(InputError, match=r"cam.yaml: can't be read \(Permission denied\); the path of a YAML file"):
         read_any_camera(path)
 
 

@@ -10,20 +10,29 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from support.hand_eye_texts import FILES, GRIP_T_CAM
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.interchange import write_camera
 from gripmon.daemon.calibrations import plane_inputs, read_calibrated
 from gripmon.daemon.config import ConfigError, load_config, read_gripper
+from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching import read_inputs
 from gripmon.judge.statefile import calibration_of
+from gripmon.model.camera import BrownConradyLens
+from gripmon.model.errors import InputError
 from gripmon.model.geometry import to_record
 from gripmon.model.provenance import provenance_of
 from gripmon.model.yaml_text import as_yaml
 from gripmon.track.edges.taught import gripper_digest
 
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"
+BROWN = BrownConradyLens(
+    **{key: getattr(PAPER_LENS, key) for key in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")},
+    coefficients=(-0.1, 0.01, 0.0, 0.0, 0.0),
+)
 COVARIANCE = tuple(np.diag([1e-10] * 3 + [1e-8] * 3).ravel().tolist())
 
 
@@ -121,7 +130,7 @@ def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):
     ("file", "edit", "line"),
     [
         (ARM, lambda v: v.update(camera="none.yaml"), "arm.yaml: camera: there is no file"),
-        (ARM, lambda v: v.update(reference="none.yaml"), "a file of gripmon calibrate plane, its path"),
+        (ARM, lambda v: v.update(reference="none.yaml"), "or another program's hand/eye result, its path"),
         (ARM, lambda v: v.update(camera="hand_eye.yaml"), "hand_eye.yaml: is a file of gripmon calibrate plane; "),
         (ARM, lambda v: v.update(gripper="camera.yaml"), "is a file of gripmon calibrate intrinsics; a gripper file"),
         (ARM, lambda v: v.update(taught="gripper.yaml"), "gripper.yaml: is a gripper file; a taught model"),
@@ -172,6 +181,87 @@ def test_a_file_that_belongs_into_a_configuration_is_named_and_where(
         load_config(folder / file)
     right = f"a configuration, such as gripmon teach writes; this file belongs there under {key}"
     assert str(caught.value) == f"{folder / file}: is {kind}; {right}"
+
+
+def listed(transform: np.ndarray) -> dict[str, Any]:
+    return json.loads(msgspec.json.encode(to_record(transform)))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_another_program_s_hand_eye_result_is_a_reference(folder: Path, name: str):
+    """Of the flange; where the TCP is in it says the configuration."""
+    (folder / "theirs").write_text(FILES[name])
+    tcp = listed(GRIP_T_CAM @ nominal_cam_T_grip())
+    section = {"hand_eye": "theirs", "flange_T_tcp": tcp, "position_sigma_m": 0.002}
+    change(folder / "arm.yaml", lambda v: v.update(reference=section))
+    config = load_config(folder / "arm.yaml")
+    np.testing.assert_allclose(config.cam_T_grip, nominal_cam_T_grip(), rtol=0.0, atol=1e-7)
+    assert config.reference.covariance[0] == 0.002**2 and config.calibrated.hand_eye is None
+    kept = from_recorded(to_recorded(config), empty(folder / "again"))
+    assert kept.reference == config.reference
+
+
+def empty(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def test_where_the_tcp_is_may_stand_in_the_robot_s_own_file(folder: Path):
+    flange = {"flange_T_cam": listed(GRIP_T_CAM), "flange_T_tcp": listed(GRIP_T_CAM @ nominal_cam_T_grip())}
+    (folder / "robot.yaml").write_text(as_yaml(flange))
+    change(folder / "arm.yaml", lambda v: v.update(reference="robot.yaml"))
+    config = load_config(folder / "arm.yaml")
+    np.testing.assert_allclose(config.cam_T_grip, nominal_cam_T_grip(), rtol=0.0, atol=1e-7)
+    for tcp in (None, listed(np.eye(4))):  # beside one that is there, it would be said twice
+        section = {"hand_eye": "robot.yaml", "flange_T_tcp": listed(np.eye(4))} if tcp else "robot.yaml"
+        (folder / "robot.yaml").write_text(as_yaml({**flange, "flange_T_tcp": tcp}))
+        change(folder / "arm.yaml", lambda v, section=section: v.update(reference=section))
+        with pytest.raises(InputError, match="is said by .*robot.yaml, too" if tcp else "flange_T_tcp: isn't said"):
+            load_config(folder / "arm.yaml")
+
+
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ("theirs", "theirs: flange_T_tcp: isn't said: where the TCP (between the fingertips, x across the jaws, z out"),
+        ("theirs", "arm.yaml: reference: {hand_eye: theirs, flange_T_tcp: …} {translation_m: [x, y, z], rotation_xyzw"),
+        ({"hand_eye": 3}, "arm.yaml: reference.hand_eye: is 3; a file of gripmon calibrate plane or another program's"),
+        ({"hand_eye": "theirs", "flange_T_tcp": {"translation_m": [0, 0, 1], "rotation_xyzw": [1, 1, 0, 0]}},
+         "arm.yaml: reference.flange_T_tcp.rotation_xyzw: has length 1.414; a unit quaternion"),
+        ({"hand_eye": "theirs", "flange_T_tcp": {"translation_m": [0, 0, 120.0], "rotation_xyzw": [0, 0, 0, 1]}},
+         "theirs: cam_T_grip.translation_m: puts the TCP 120.119 m from the camera; metres"),
+        ({"hand_eye": "theirs", "cam_T_grip": {}}, "arm.yaml: reference.cam_T_grip: has no place beside hand_eye"),
+        ({"hand_eye": HE, "id": "a"}, "arm.yaml: reference.id: stands beside hand_eye.yaml, a file of gripmon's that"),
+        (CAM, "camera.yaml: is a file of gripmon calibrate intrinsics; a file of gripmon calibrate plane"),
+        ({"hand_eye": ARM, "flange_T_tcp": {}}, "arm.yaml: is a configuration; a file of gripmon calibrate plane, a"),
+    ],
+)  # fmt: skip
+def test_a_reference_that_says_too_little_or_too_much_is_one_line(folder: Path, section: Any, line: str):
+    (folder / "theirs").write_text(FILES["easy_handeye"])
+    change(folder / "arm.yaml", lambda v: v.update(reference=section))
+    with pytest.raises(InputError) as caught:
+        load_config(folder / "arm.yaml")
+    assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_another_program_s_file_is_opened_once(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    (folder / "theirs").write_text(FILES["easy_handeye"])
+    lens = CameraCalibration(camera=BROWN, parameters=(), covariance=(), provenance=provenance_of("a"))
+    (folder / "camera_info").write_bytes(write_camera(lens.camera, "ros", (), name="wrist", file="x").data)
+    tcp = listed(GRIP_T_CAM @ nominal_cam_T_grip())
+    section = {"hand_eye": "theirs", "flange_T_tcp": tcp}
+    change(folder / "arm.yaml", lambda v: v.update(camera="camera_info", reference=section))
+    opened: list[str] = []
+    real = Path.open
+
+    def counted(path: Path, *args: Any, **options: Any) -> Any:
+        opened.append(path.name)
+        return real(path, *args, **options)
+
+    monkeypatch.setattr(Path, "open", counted)
+    load_config(folder / "arm.yaml")
+    read_calibrated(folder / "camera_info")
+    assert [opened.count(name) for name in ("theirs", "camera_info")] == [1, 2]
 
 
 def test_a_file_of_corners_or_of_the_set_up_is_no_configuration_either(tmp_path: Path):

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-from gripmon.calibrate.bundle import centre_offsets_px
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.lens_models import centre_offsets_px
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 from gripmon.model.records import Array

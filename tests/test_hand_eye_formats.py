@@ -7,147 +7,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.foreign_files import read_hand_eye
+from support.hand_eye_texts import (
+    COMMAND,
+    EASY_1,
+    EASY_2,
+    FILES,
+    FRAMES,
+    GRIP_T_CAM,
+    MOVEIT_1,
+    MOVEIT_2,
+    QW,
+    QX,
+    SHIFT,
+    X,
+    Y,
+    Z,
+)
 
 from gripmon.calibrate.foreign import InterchangeError
 from gripmon.calibrate.hand_eye_files import HAND_EYE_FORMATS, HandEye, write_hand_eye
-from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.cli import main
 from gripmon.daemon.calibrations import pose_in, read_calibrated
+from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, invert, to_record
 
-SHIFT, TURN = (0.012, -0.063, -0.119), (-0.258819, 0.0, 0.0, 0.9659258)
-GRIP_T_CAM = np.eye(4)
-GRIP_T_CAM[:3, :3], GRIP_T_CAM[:3, 3] = Rotation.from_quat(TURN).as_matrix(), SHIFT
-X, Y, Z = SHIFT
-QX, QY, QZ, QW = TURN
-ROLL, PITCH, YAW = Rotation.from_quat(TURN).as_euler("xyz")
-FRAMES = "tool0", "camera_color_optical_frame"
-EASY_1 = f"""parameters:
-  eye_on_hand: true
-  freehand_robot_movement: false
-  move_group: manipulator
-  move_group_namespace: /
-  namespace: /ur_eye_on_hand/
-  robot_base_frame: base_link
-  robot_effector_frame: tool0
-  tracking_base_frame: camera_color_optical_frame
-  tracking_marker_frame: aruco_marker_frame
-transformation:
-  qw: {QW}
-  qx: {QX}
-  qy: {QY}
-  qz: {QZ}
-  x: {X}
-  y: {Y}
-  z: {Z}
-"""
-EASY_2 = f"""parameters:
-  name: wrist
-  calibration_type: eye_in_hand
-  robot_base_frame: base_link
-  robot_effector_frame: tool0
-  tracking_base_frame: camera_color_optical_frame
-  tracking_marker_frame: aruco_marker_0
-  freehand_robot_movement: true
-  move_group_namespace: /
-  move_group: manipulator
-transform:
-  translation:
-    x: {X}
-    y: {Y}
-    z: {Z}
-  rotation:
-    x: {QX}
-    y: {QY}
-    z: {QZ}
-    w: {QW}
-"""
-MOVEIT_2 = f'''""" Static transform publisher acquired via MoveIt 2 hand-eye calibration """
-""" EYE-IN-HAND: tool0 -> camera_color_optical_frame """
-from launch import LaunchDescription
-from launch_ros.actions import Node
-
-
-def generate_launch_description() -> LaunchDescription:
-    nodes = [
-        Node(
-            package="tf2_ros",
-            executable="static_transform_publisher",
-            output="log",
-            arguments=[
-                "--frame-id",
-                "tool0",
-                "--child-frame-id",
-                "camera_color_optical_frame",
-                "--x",
-                "{X}",
-                "--y",
-                "{Y}",
-                "--z",
-                "{Z}",
-                "--qx",
-                "{QX}",
-                "--qy",
-                "{QY}",
-                "--qz",
-                "{QZ}",
-                "--qw",
-                "{QW}",
-                # "--roll",
-                # "9.9",
-                # "--pitch",
-                # "9.9",
-            ],
-        ),
-    ]
-    return LaunchDescription(nodes)
-'''
-MOVEIT_1 = f"""<launch>
-  <!-- The rpy in the comment uses the extrinsic XYZ convention, which is the same as is used in a URDF. See
-       http://wiki.ros.org/geometry2/RotationMethods and https://en.wikipedia.org/wiki/Euler_angles for more info. -->
-  <!-- xyz="9 9 9" rpy="9 9 9" -->
-  <node pkg="tf2_ros" type="static_transform_publisher" name="camera_link_broadcaster"
-      args="{X} {Y} {Z}   {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame" />
-</launch>
-"""
-COMMAND = "ros2 run tf2_ros static_transform_publisher"
-OPTIONS = f"--x {X} --y {Y} --z {Z} --qx {QX} --qy {QY} --qz {QZ} --qw {QW}"
-FILES = {
-    "easy_handeye": EASY_1,
-    "easy_handeye2": EASY_2,
-    "moveit 2": MOVEIT_2,
-    "moveit 1": MOVEIT_1,
-    "static transform, options": f"{COMMAND} {OPTIONS} --frame-id tool0 --child-frame-id camera_color_optical_frame\n",
-    "static transform, over two lines": f"# calibrated on Monday\n{COMMAND} {OPTIONS} \\\n  --frame-id /tool0 "
-    "--child-frame-id camera_color_optical_frame --ros-args -r __node:=a\n",
-    "static transform, angles": f"{COMMAND} --x {X} --y {Y} --z {Z} --roll {ROLL} --pitch {PITCH} --yaw {YAW} "
-    "--frame-id tool0 --child-frame-id camera_color_optical_frame\n",
-    "static transform, with =": f"{COMMAND} --x={X} --y={Y} --z={Z} --qx={QX} --qy={QY} --qz={QZ} --qw={QW} "
-    "--frame-id=tool0 --child-frame-id=camera_color_optical_frame 2>&1 >/dev/null &  # the wrist\n",
-    "static transform, by place": f"{COMMAND} {X} {Y} {Z} {QX} {QY} {QZ} {QW} tool0 camera_color_optical_frame\n",
-    "static transform, ROS 1's period": "rosrun tf static_transform_publisher "
-    f"{X} {Y} {Z} {YAW} {PITCH} {ROLL} tool0 camera_color_optical_frame 100 __name:=a\n",
-    "static transform, in YAML": f"launch:\n- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n    args: "
-    f'"{OPTIONS} --frame-id tool0 --child-frame-id camera_color_optical_frame"\n',
-    "urdf": '<robot name="r"><joint name="a" type="revolute"><parent link="a"/><child link="b"/></joint>'
-    f'<joint name="cam" type="fixed"><origin xyz="{X} {Y} {Z}" rpy="{ROLL} {PITCH} {YAW}"/><parent link="tool0"/>'
-    '<child link="camera_color_optical_frame"/></joint></robot>',
-}
-
-
-# A name is no executable.
-OTHERS = '''Node(package="a", executable="b", name="static_transform_publisher_b", arguments=["--x", f(1)]),
-        Node(package="tf2_ros", name="static_transform_publisher_cam (\\")",'''
-FILES["moveit 2, among other nodes"] = MOVEIT_2.replace("Node(\n", OTHERS, 1).replace(
-    "        ),\n", '        ),\n        Node(executable="c", arguments=["static_transform_publisher", "--y"]),\n', 1
-)
-FILES["moveit 1, among other nodes"] = MOVEIT_1.replace(
-    "  <node", '  <node pkg="a" type="b" name="static_transform_publisher_b" args="1 2 3" />\n  <node', 1
-).replace("camera_link_broadcaster", "static_transform_publisher_camera_link_broadcaster")
-FILES["static transform, in YAML with names"] = FILES["static transform, in YAML"].replace(
-    "    pkg", "    name: static_transform_publisher cam\n    pkg"
-).replace("launch:\n", "launch:\n- node: {pkg: a, exec: b, name: static_transform_publisher_b, args: 1 2 3}\n")
-
+AT_TOOL0 = "flange_T_tcp: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 0, 1]}"
 
 @pytest.mark.parametrize("name", FILES)
 def test_each_file_gives_the_camera_s_pose_in_the_gripper_s_frame(name: str, tmp_path: Path):
@@ -155,12 +40,18 @@ def test_each_file_gives_the_camera_s_pose_in_the_gripper_s_frame(name: str, tmp
     assert found is not None and (found.gripper_frame, found.camera_frame) == FRAMES
     np.testing.assert_allclose(found.grip_T_cam, GRIP_T_CAM, rtol=0.0, atol=1e-7)
     assert found.kind == name.partition(",")[0].rstrip(" 12") or found.kind == name
-    # As an option takes it, and imported.
+    # As an option takes it, and imported: where the TCP is in tool0 is asked for.
     path, out = tmp_path / "theirs.yaml", tmp_path / "reference.yaml"
     path.write_text(FILES[name])
     assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
     for file in (path, out):
-        np.testing.assert_allclose(pose_in(file)[0] @ GRIP_T_CAM, np.eye(4), rtol=0.0, atol=1e-7)
+        with pytest.raises(InputError, match=rf"{file}: flange_T_tcp: isn't said: where the TCP .* is in tool0; "):
+            pose_in(file)
+    assert main(["calibrate", "verify", str(path), str(out)]) == 0  # of one frame, wherever the TCP is
+    assert "flange_T_tcp: null" in out.read_text()
+    out.write_text(out.read_text().replace("flange_T_tcp: null", AT_TOOL0))
+    np.testing.assert_allclose(pose_in(out)[0] @ GRIP_T_CAM, np.eye(4), rtol=0.0, atol=1e-7)
+    assert main(["calibrate", "verify", str(path), str(out)]) == 2
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -263,14 +154,37 @@ def test_a_flange_behind_the_camera_is_imported_and_completed_by_hand(tmp_path: 
     path, out = tmp_path / "theirs.calib", tmp_path / "reference.yaml"
     path.write_text(EASY_2.replace(f"z: {Z}", "z: 0.074"))
     assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
-    assert "if the TCP isn't at tool0 (x across the jaws, z out): flange_T_tcp" in capsys.readouterr().out
+    assert "flange_T_tcp is to be filled in: where the TCP (between the fingertips" in capsys.readouterr().out
+    text = out.read_text()
+    out.write_text(text.replace("flange_T_tcp: null", AT_TOOL0))
     assert main(["calibrate", "verify", str(out), str(out)]) == 2
     assert "behind the camera" in capsys.readouterr().err
-    text = out.read_text()
-    out.write_text(text.replace("[0.0, 0.0, 0.0]", "[0.0, 0.0, 0.2]"))
-    assert out.read_text() != text and main(["calibrate", "verify", str(out), str(out)]) == 0
+    out.write_text(text.replace("flange_T_tcp: null", AT_TOOL0.replace("[0, 0, 0]", "[0, 0, 0.2]")))
+    assert main(["calibrate", "verify", str(out), str(out)]) == 0
     assert main(["calibrate", "import", str(path), "--model", "fisheye", "--out", str(tmp_path / "x.yaml")]) == 2
     assert "is a hand/eye transform (easy_handeye2)" in capsys.readouterr().err
+
+
+def test_a_file_that_is_written_of_another_one_keeps_its_frame(tmp_path: Path):
+    """Else tool0 would come back as the TCP."""
+    path, out = tmp_path / "theirs.yaml", tmp_path / "again.calib"
+    path.write_text(EASY_1)
+    assert main(["calibrate", "export", str(path), "--format", "easy_handeye2", "--out", str(out)]) == 0
+    again = read_hand_eye(out.read_bytes(), "x")
+    assert again is not None and again.gripper_frame == "tool0" and not again.at_tcp
+    np.testing.assert_allclose(again.grip_T_cam, GRIP_T_CAM, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(1e3, r"\(135.181 mm were meant\?\)"), (1e6, r"another unit was meant\?")]
+)
+def test_millimetres_are_asked_for(factor: float, said: str):
+    text = EASY_1
+    for value in SHIFT:
+        text = text.replace(f": {value}\n", f": {factor * value}\n")
+    said = rf"puts {FRAMES[1]} {factor * 0.135181:g} m from tool0; metres .*{said}"
+    with pytest.raises(InterchangeError, match=said):
+        read_hand_eye(text.encode(), "x")
 
 
 def joint(parent: str, child: str, xyz: str, rpy: str = "0 0 0", more: str = "") -> str:
@@ -355,7 +269,7 @@ def test_a_covariance_that_is_none_is_not_imported(variance: float, tmp_path: Pa
     for command in (["import", str(path), "--out", str(out)], ["verify", str(path), str(path)]):
         assert main(["calibrate", *command]) == 2
         said = capsys.readouterr().err
-        assert "theirs.json: reference.covariance: " in said and "a symmetric 6x6 matrix with positive eigen" in said
+        assert "theirs.json: covariance: " in said and "a symmetric 6x6 matrix with positive eigen" in said
     assert not out.exists()
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
+from support.foreign_files import read_camera
 
-from gripmon.calibrate.camera_files import read_camera
 from gripmon.calibrate.foreign import InterchangeError
 from gripmon.calibrate.interchange import FORMATS, fit_brown_conrady, write_camera
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera

@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import f as fisher_f
 from support.laser_scenes import PAPER_LENS, assert_same, numeric, scene
 
-from gripmon.calibrate.bundle import GivenCamera, LensModel, parameter_names
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser import closed_form, refinement
 from gripmon.laser.calibrating import Spots, calibrate, contradictions

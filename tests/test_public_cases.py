@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from gripmon.cli import main
-from gripmon.daemon.calibrations import camera_in, pose_in
+from gripmon.daemon.calibrations import camera_in, read_calibrated
 from gripmon.model.camera import FisheyeLens
+from gripmon.model.geometry import from_record
 
 CASES = next(
     (here for up in Path(__file__).resolve().parents for here in up.glob("shared/findings/*/public_cases")), None
@@ -79,7 +80,9 @@ def test_15_hand_eye_files(name: str, tmp_path: Path):
     path, out = case(15) / name, tmp_path / "reference.yaml"
     assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
     for file in (path, out):
-        cam_T_grip = pose_in(file)[0]
+        found = read_calibrated(file)
+        cam_T_grip = from_record(found.cam_T_grip)
+        assert found.frame == "tool0"
         np.testing.assert_allclose(cam_T_grip[:3, 3], [0.0, -0.0049, 0.1346], atol=1e-4)
         turn = np.radians(30.0)  # rotation_xyzw 0.2588, 0, 0, 0.9659
         expected = [[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]]

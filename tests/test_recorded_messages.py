@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 from support.episode_files import NS, STORE, Shots, write_mcap, write_rosbag2, write_video
+from support.foreign_files import read_camera
 from test_episode_sources import BEGIN_NS, FINGERS, LENS, frames_of, shots
 
-from gripmon.calibrate.camera_files import read_camera
 from gripmon.io.sources import BagSettings, FolderSettings, SourceError, VideoSettings, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.io.sources.stamps import JUMP_NS, Stamped, rising

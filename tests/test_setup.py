@@ -26,9 +26,9 @@ from support.loopback import frame_record, free_endpoint, wait_until
 from gripmon.calibrate.sighting import Sighting
 from gripmon.cli import main
 from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.config.robot_file import reference_text
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.overlay import outlines_of, overlay
-from gripmon.daemon.robot_file import reference_text
 from gripmon.daemon.setup import STEPS, Project, SetupSite
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import other_target, target_in

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, ncx2
 
-from gripmon.calibrate.bundle import GivenCamera, LensModel, parameter_names
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.interchange import fit_brown_conrady
+from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import agreeing, compare_cameras, compare_hand_eye, mean_of_one_scene
 from gripmon.model.camera import FisheyeLens, PaperLens, make_camera

@@ -20,10 +20,12 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate import intrinsics, robot_world
-from gripmon.calibrate.bundle import MODELS, ContradictionError, ModelName, parameter_names
+from gripmon.calibrate.bundle import ContradictionError
+from gripmon.calibrate.cross_validation import cross_validate, with_scatter
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.intrinsics import IntrinsicsResult
+from gripmon.calibrate.lens_models import MODELS, ModelName, parameter_names
 from gripmon.calibrate.markers import other_dictionary
 from gripmon.calibrate.robot_world import RobotWorld
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
@@ -164,12 +166,14 @@ def _views(
     sightings: list[Sighting] = []
     not_found: dict[str, str] = {}
     larger: list[str] = []
+    smaller: list[str] = []
     with progress(len(images), "image") as step:
         for name, image in images_of_one_camera(images):
             sight = detect(image, target, name)
             if isinstance(sight, NotFound):
                 not_found[name] = sight.reason
                 larger += [f"{name}: {sight.reason}"] if sight.larger else []
+                smaller += [f"{name}: {sight.reason}"] if sight.smaller else []
             else:
                 sightings.append(sight)
             step()
@@ -186,6 +190,9 @@ def _views(
     if larger:
         # If the rest is hidden or out of view, a smaller target fits as well: such images prove nothing.
         raise TargetError(f"{len(larger)} of {len(images)} images show a larger one ({larger[0]}); its full size")
+    if smaller and not any(sighting.anchored for sighting in sightings):
+        of = f"{len(smaller)} of {len(images)} images show a smaller one whole, none this one"
+        raise TargetError(f"{of} ({smaller[0]}); its full size")
     return sightings, not_found
 
 
@@ -220,8 +227,8 @@ def _fitted(
         else:
             result = intrinsics.calibrate(sightings, model, fixed=fixed)
             step()
-        crossed = intrinsics.cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
-    return replace(result, cross_validated_rms_px=crossed)
+        crossed = cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
+    return with_scatter(result, crossed, sightings)
 
 
 def _about_target(sightings: list[Sighting], target: Target) -> list[str]:

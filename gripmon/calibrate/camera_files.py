@@ -7,11 +7,11 @@ doesn't say is asked for, never guessed: which of several cameras, the image's s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gripmon.calibrate.camera_formats import READ, ROS_MESSAGE, FileLens, cameras_in, of_message
+from gripmon.calibrate.camera_formats import ROS_MESSAGE, FileLens, cameras_in, of_message
 from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 
@@ -20,6 +20,7 @@ LARGEST_TANGENTIAL = 0.01
 """Tangential coefficient above which a lens is more likely a fisheye, whose third and fourth coefficient stand there: a
 lens that is tilted by a whole degree has less.
 """
+_MOST_NAMED = 6
 _ASKED = "gripmon calibrate import with --model fisheye, or with --model brown_conrady if it is really one"
 
 
@@ -33,27 +34,34 @@ class ForeignCamera:
 
 
 def read_camera(
-    data: bytes,
-    file: str,
+    document: Document,
     *,
     which: str | None = None,
     size_px: tuple[int, int] | None = None,
     model: LensModel | None = None,
 ) -> ForeignCamera:
-    """The camera in a file's bytes.  Options for what a file may leave open: ``which`` of several cameras, the image's
+    """The camera in a file.  Options for what a file may leave open: ``which`` of several cameras, the image's
     size, and the lens's model, which also overrules a file that calls a fisheye ``plumb_bob``.
     :class:`InterchangeError` for a file that holds none, for one that no monitor can use, and for one that leaves open
     what no option says.
     """
-    kind, cameras = cameras_in(Document(file, data, READ))
+    file = document.file
+    kind, cameras = cameras_in(document)
     if which is None and len(cameras) > 1:
-        raise InterchangeError(
-            file, "", f"holds {len(cameras)} cameras", f"gripmon calibrate import with --camera {' or '.join(cameras)}"
-        )
+        right = f"gripmon calibrate import with --camera {_named(cameras)}"
+        raise InterchangeError(file, "", f"holds {len(cameras)} cameras", right)
     if which not in (None, *cameras):
-        raise InterchangeError(file, str(which), "is not a camera of this file", " or ".join(cameras))
+        raise InterchangeError(file, str(which), "is not a camera of this file", _named(cameras))
     lens = cameras[which or next(iter(cameras))]()
     return ForeignCamera(kind, *_checked(file, lens, size_px, model))
+
+
+def _named(cameras: Iterable[str]) -> str:
+    """The names, of many only some: of a RealSense's streams and sizes those in colour first."""
+    names = list(cameras)
+    if len(names) > _MOST_NAMED:
+        names = [*sorted(names, key=lambda name: not name.startswith("Color"))[:_MOST_NAMED], "…"]
+    return " or ".join(names)
 
 
 def _checked(

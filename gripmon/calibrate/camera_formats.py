@@ -46,6 +46,8 @@ def cameras_in(document: Document) -> tuple[str, Cameras]:
         return "ost", _ost(document)
     if lines := _COLMAP_LINE.findall(text):
         return "colmap", {line.split()[0]: partial(_colmap, document.file, line) for line in lines}
+    if streams := _STREAM.findall(text):
+        return "realsense", _streams(document.file, streams)
     content = document.content
     if any(_CAM.fullmatch(key) and isinstance(value, Mapping) for key, value in content.items()):
         return "kalibr", _kalibr(document.values(_KALIBR))
@@ -229,6 +231,26 @@ def _realsense(values: FileValues, name: str = "") -> Cameras:
         if isinstance(value, Mapping) and isinstance(key, str) and name.count(".") < 3:
             found.update(_realsense(values.below(key), f"{name}.{key}".strip(".")))
     return found
+
+
+_STREAM = re.compile(
+    r'^[ \t]*Intrinsic of "([^"\n]+)" / (\d+x\d+) / \{([^}\n]*)\}[ \t]*\n((?:[ \t]+\w.*:.*\n?)+)', re.MULTILINE
+)
+
+
+def _streams(file: str, streams: list[tuple[str, str, str, str]]) -> Cameras:
+    """What ``rs-enumerate-devices -c`` prints: a section for each stream and size, alike for most pixel formats."""
+    sections: dict[str, dict[str, Any]] = {}
+    for stream, size, formats, body in streams:
+        lines = (line.partition(":") for line in body.splitlines())
+        content: dict[str, Any] = {key.strip().lower(): value.strip() for key, _, value in lines}
+        content["coeffs"], content["model"] = content.get("coeffs", "").split(), content.pop("distortion", "")
+        name = f"{stream}/{size}".replace(" ", "_")
+        sections[name if sections.get(name, content) == content else f"{name}/{formats}"] = content
+    return {
+        name: partial(_realsense_camera, FileValues(file, content, _REALSENSE, f"{name}: "))
+        for name, content in sections.items()
+    }
 
 
 def _realsense_camera(values: FileValues) -> FileLens:

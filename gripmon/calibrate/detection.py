@@ -85,7 +85,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     window = np.minimum(CORNER_RADIUS, 1.3 * margin) * steps - (1.0 if 1.3 * margin < CORNER_RADIUS else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
-    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
+    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"], True)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
@@ -95,7 +95,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     cells, rough = _arrays(found[0])
     fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
     if fewer or not fits(found[0], target.columns, target.rows, least=2):
-        return _wrong_count(cells, target.columns, target.rows, "inner corners")
+        return _wrong_count(cells, target.columns, target.rows, "inner corners", fewer)
     steps = _steps(cells, rough)
     starts, ends = _across_squares(cells, rough)
     blur_px = edge_blur_px(grey, starts, ends)
@@ -105,7 +105,9 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     uv_px, covariance, good = _sharp(grey, rough, CORNER_RADIUS * steps, cells)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST["chequerboard"])
+    whole = _whole(cells, target.columns, target.rows)
+    fewest = FEWEST["chequerboard"]
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, fewest, whole)
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
@@ -133,8 +135,10 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
     covariance = np.array([np.eye(2) if centre is None else centre[1] for centre in centres])
     plate = np.concatenate([places * target.step_m, np.zeros((len(cells), 1))], axis=1)
+    whole = _whole(places, *(max(each) + 1 for each in zip(*target.places, strict=True)))
     radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), len(target.places), blur_px)
-    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, FEWEST["circles"])
+    fewest = FEWEST["circles"]
+    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, fewest, whole)
 
 
 def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGrid) -> NDArray[np.intp] | NotFound:
@@ -149,7 +153,7 @@ def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGri
         return NotFound(reason)
     fewer = incomplete and ends_all_round(grey, cells, rough, squares=False)
     if fewer or max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
-        return _wrong_count(cells, columns, rows, "discs")
+        return _wrong_count(cells, columns, rows, "discs", fewer)
     return _turned(cells, columns, rows)
 
 
@@ -177,11 +181,12 @@ def _sighting(
     name: str,
     note: str,
     fewest: int,
+    anchored: bool,
 ) -> Sighting | NotFound:
     if good.sum() < fewest:
         return NotFound(f"{int(good.sum())} points of the target are sharp and free; at least {fewest}")
     size = (grey.shape[1], grey.shape[0])
-    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note)
+    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note, anchored)
 
 
 def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
@@ -189,6 +194,10 @@ def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp
     order = sorted(lattice, key=lambda cell: (cell[1], cell[0]))
     cells = np.array(order, np.intp)
     return cells - cells.min(axis=0), np.array([lattice[cell] for cell in order])
+
+
+def _whole(cells: NDArray[np.intp], columns: int, rows: int) -> bool:
+    return tuple((np.ptp(cells, axis=0) + 1).tolist()) == (columns, rows)
 
 
 def _turned(cells: NDArray[np.intp], columns: int, rows: int) -> NDArray[np.intp]:
@@ -205,11 +214,12 @@ def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
     return out
 
 
-def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str) -> NotFound:
+def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str, ends: bool) -> NotFound:
     # The longer side first, as in the target.
     seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
     larger = max(seen) > max(columns, rows) or min(seen) > min(columns, rows)
-    return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}", larger)
+    wrong = f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}"
+    return NotFound(wrong, larger, ends and not larger)
 
 
 def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:

@@ -147,15 +147,18 @@ def read_mapping(file: str, text: str, right: str) -> dict[str, Any]:
     return value
 
 
-class Document:
-    """A file of another program; ``right`` says which may be read."""
+_RIGHT = "YAML, JSON, XML or what ROS prints, as UTF-8"
 
-    def __init__(self, file: str, data: bytes, right: str) -> None:
-        self.file, self._right = file, right
+
+class Document:
+    """A file's content for every reader, decoded and parsed once, whichever of them asks."""
+
+    def __init__(self, file: str, data: bytes) -> None:
+        self.file = file
         try:
-            self.text = data.decode("utf-8-sig").replace("\r\n", "\n")
+            self.text = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
         except UnicodeDecodeError as error:
-            raise InterchangeError(file, "", f"is not text (byte {error.start} is not UTF-8)", right) from None
+            raise InterchangeError(file, "", f"is not text (byte {error.start} is not UTF-8)", _RIGHT) from None
 
     @functools.cached_property
     def content(self) -> dict[str, Any]:
@@ -163,7 +166,7 @@ class Document:
         text = self.text.lstrip()
         found: Any = None
         if text.startswith("<"):
-            found = _as_xml(self.file, text, self._right)
+            found = _as_xml(self.file, text)
         elif text.startswith("{"):
             try:
                 found = json.loads(text)
@@ -172,7 +175,7 @@ class Document:
             except (RecursionError, ValueError):  # ValueError: an integer of thousands of digits
                 found = None
         if found is None:
-            found = _as_yaml(self.file, _first_document(self.text), self._right)
+            found = _as_yaml(self.file, _first_document(self.text), _RIGHT)
         return found if isinstance(found, dict) else {}
 
     def values(self, right: str) -> FileValues:
@@ -185,14 +188,14 @@ def _first_document(text: str) -> str:
     it takes text without; lines keep their numbers.
     """
     lines: list[str] = []
-    for line in text.splitlines():
+    for line in text.splitlines(keepends=True):
         if line.startswith(("%YAML", "---", "...")):
             if any(one.strip() and not one.lstrip().startswith("#") for one in lines):
                 break
-            line = ""
+            line = "\n"
         line = re.sub(r"^(\s*[A-Za-z_][\w.]*):\[", r"\1: [", line)
         lines.append(re.sub(r"!!opencv-[\w-]+", "", line))
-    return "\n".join(lines)
+    return "".join(lines)
 
 
 def _as_yaml(file: str, text: str, right: str) -> Any:
@@ -202,18 +205,18 @@ def _as_yaml(file: str, text: str, right: str) -> Any:
         raise InterchangeError(file, fault.where, fault.wrong, fault.right or right) from None
 
 
-def _as_xml(file: str, text: str, right: str) -> dict[str, Any] | None:
+def _as_xml(file: str, text: str) -> dict[str, Any] | None:
     """The children of ``<opencv_storage>``: text, several words, or more of the same; other XML is none."""
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise InterchangeError(file, "", f"not XML: {error}", right) from None
+        raise InterchangeError(file, "", f"not XML: {error}", _RIGHT) from None
     if root.tag != "opencv_storage":
         return {}
     try:
         return {child.tag: _plain(child) for child in root}
     except RecursionError:
-        raise InterchangeError(file, "", "is nested too deeply", right) from None
+        raise InterchangeError(file, "", "is nested too deeply", _RIGHT) from None
 
 
 def _plain(node: ElementTree.Element) -> Any:

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.foreign import number_text
+from gripmon.calibrate.hand_eye_formats import TCP_FRAME
 from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.records import Array, Transform
 
@@ -36,7 +37,7 @@ class HandEye:
 
     cam_T_grip: Transform
     covariance: tuple[float, ...]
-    gripper_frame: str = "gripper_tcp"
+    gripper_frame: str = TCP_FRAME
     camera_frame: str = "camera_optical_frame"
     gripper_in_camera: bool = False
     name: str = "gripmon"

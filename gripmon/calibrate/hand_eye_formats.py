@@ -20,7 +20,13 @@ from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, invert, make_tr
 from gripmon.model.records import Array
 
 _ANGLES, _QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
-READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
+_READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
+FARTHEST_M = 5.0
+"""Distance of a gripper from its wrist camera beyond which another unit was meant."""
+TCP_FRAME = "gripper_tcp"
+"""The frame that is called so, as :mod:`gripmon.calibrate.hand_eye_files` calls it, is at the TCP; where the TCP is in
+any other frame, a file of these formats doesn't say.
+"""
 BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up) instead of a camera's (z forward)"
 _FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
@@ -45,15 +51,20 @@ class ForeignHandEye:
     covariance: tuple[float, ...] | None = None
     doubt: str = ""
 
+    @property
+    def at_tcp(self) -> bool:
+        """Whether the file itself says that the gripper's frame is at the TCP."""
+        return self.covariance is not None or self.gripper_frame == TCP_FRAME
 
-def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> ForeignHandEye | None:
-    """The hand/eye transform in a file's bytes; None if the file is of none of these formats.  ``which`` names the
-    camera's frame, of several transforms or where neither name looks like a camera's.
 
-    :class:`InterchangeError` for a fixed camera, and for a frame with the axes of ROS bodies in place of a camera's.
+def read_hand_eye(document: Document, *, which: str | None = None) -> ForeignHandEye | None:
+    """The hand/eye transform in a file; None if the file is of none of these formats.  ``which`` names the camera's
+    frame, of several transforms or where neither name looks like a camera's.
+
+    :class:`InterchangeError` for a fixed camera, for a frame with the axes of ROS bodies in place of a camera's, and
+    for millimetres.
     """
-    document = Document(file, data, READ)
-    found = list(_transforms(document))
+    file, found = document.file, list(_transforms(document))
     if not found:
         return None
     pair = _joined(file, _chosen(file, found, which), found)
@@ -61,6 +72,10 @@ def read_hand_eye(data: bytes, file: str, *, which: str | None = None) -> Foreig
     if pair.camera is None and _BASE.match(hand_eye.gripper_frame):
         _refuse_fixed(file, hand_eye, which, len(_likely(found)) == 1)
     camera = hand_eye.camera_frame
+    apart_m = float(np.linalg.norm(hand_eye.grip_T_cam[:3, 3]))
+    if apart_m > FARTHEST_M:
+        wrong = f"puts {camera} {apart_m:g} m from {hand_eye.gripper_frame}"
+        raise InterchangeError(file, "", wrong, f"metres ({meant(apart_m)})")
     body = _body(invert(hand_eye.grip_T_cam), camera)
     if body:
         wrong = f"ends in {camera}, whose x points along the gripper: {BODY_AXES}"
@@ -180,6 +195,11 @@ def _body(cam_T_grip: Array, name: str) -> bool | None:
     return None if called else False
 
 
+def meant(distance_m: float) -> str:
+    """The question about a distance beyond :data:`FARTHEST_M`."""
+    return f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
+
+
 def lies_along_x(cam_t_tcp: Array) -> bool:
     """Whether a place (3,) lies before a ROS body rather than before a camera, along x instead of z."""
     x, y, z = cam_t_tcp.tolist()
@@ -194,7 +214,7 @@ def _transforms(document: Document) -> Iterator[_Pair]:
         yield from _joints(document)
         return
     try:
-        values = document.values(READ)
+        values = document.values(_READ)
     except InterchangeError:  # no YAML: whoever reads cameras says so
         return
     content = values.content

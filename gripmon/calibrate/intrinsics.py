@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 from gripmon.calibrate.bundle import (
     DEGENERATE,
@@ -22,14 +23,12 @@ from gripmon.calibrate.bundle import (
     BundleProblem,
     ContradictionError,
     Effort,
-    LensModel,
-    ModelName,
-    lens_vector,
     merit,
-    parameter_names,
     plate_pose_start,
 )
+from gripmon.calibrate.lens_models import LensModel, ModelName, lens_vector, parameter_names
 from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.target_shape import CHANCE, TargetPoints, off_plane_m
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import log_rotation
 from gripmon.model.records import Array
@@ -55,10 +54,12 @@ def calibrate(
     *,
     fixed: Fixed = MappingProxyType({}),
     near: LensSettings | None = None,
+    exact_target: bool | None = None,
 ) -> IntrinsicsResult:
     """Calibrate a camera from views of a plane, all of one size.  Parameters named in ``fixed`` keep the value given
     there, or with None their start (the principal point at the image's centre, coefficients 0); ``"aspect"`` ties
-    ``fy_px`` to ``fx_px``.  ``near``: a camera of this model to start from, if one is known.
+    ``fy_px`` to ``fx_px``.  ``near``: a camera of this model to start from, if one is known.  ``exact_target``: whether
+    its points are where they should be; None: as the views show.
 
     Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
     no convergence, or an implausible lens.
@@ -66,6 +67,7 @@ def calibrate(
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
     names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
+    target, bundle = _of_uneven_target(lens_model, sightings, free, bundle, exact_target)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
     poses = range(len(sightings))
@@ -79,9 +81,34 @@ def calibrate(
         residuals_px=bundle.residuals_px,
         used=bundle.used,
         rms_px=bundle.rms_px,
-        criterion={model: _bayes(bundle, p)},
+        criterion={model: _bayes(bundle, p + (0 if target is None else target.unknowns))},
+        target=target,
+        displacement_m=bundle.displacement_m,
     )
     return replace(result, warnings=(*held, *doubts_of(result, sightings)))
+
+
+def _of_uneven_target(
+    lens_model: LensModel, sightings: Sequence[Sighting], free: Array, bundle: Bundle, exact: bool | None
+) -> tuple[TargetPoints | None, Bundle]:
+    """The fit with the displacements of the target's points as unknowns, and these points, if the residuals at each of
+    them are so alike in all images that an exact target wouldn't show it; else the fit that it is given.
+    """
+    target = None if exact else TargetPoints.of(sightings)
+    if target is None or bundle.degrees_of_freedom <= target.unknowns:
+        return None, bundle
+    problem = BundleProblem(lens_model, sightings, free, target=target)
+    if exact is None:
+        ratio = problem.gain(bundle) / target.unknowns
+        if fdtrc(target.unknowns, bundle.degrees_of_freedom, ratio) > CHANCE:
+            return None, bundle
+    found = problem.solve(bundle.parameters, bundle.cam_T_plate)
+    check_fit(lens_model, found, free)
+    try:
+        make_camera(lens_model.settings(found.parameters))
+    except ValueError:
+        return None, bundle
+    return target, found
 
 
 def calibrate_best(
@@ -161,42 +188,6 @@ def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array, fixed: F
         turned = log_rotation(other[:3, :3] @ pose[:3, :3].T)
         out.append((bundle.parameters - at, np.concatenate([other[:3, 3] - pose[:3, 3], turned])))
     return out
-
-
-def cross_validate(
-    sightings: Sequence[Sighting],
-    model: ModelName,
-    *,
-    fixed: Fixed = MappingProxyType({}),
-    folds: int = 5,
-    step: Callable[[], None] = lambda: None,
-) -> float | None:
-    """Root mean square residual (px) of views that were left out of the calibration, with only their own pose fitted;
-    None with fewer than four views.
-    """
-    if len(sightings) < 4:
-        return None
-    folds = min(folds, len(sightings))
-    squares, count = 0.0, 0
-    try:
-        near = calibrate(sightings, model, fixed=fixed).camera
-    except CalibrationError:
-        return None
-    for fold in range(folds):
-        others = [s for k, s in enumerate(sightings) if k % folds != fold]
-        try:
-            camera = calibrate(others, model, fixed=fixed, near=near)
-        except CalibrationError:
-            step()
-            continue
-        lens_model, parameters = LensModel(model, *_one_size(sightings)), lens_vector(camera.camera)
-        for sighting in sightings[fold::folds]:
-            pose = plate_pose_start(lens_model, parameters, sighting)
-            bundle = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0))).solve(parameters, [pose])
-            residuals = bundle.residuals_px[0][bundle.used[0]]
-            squares, count = squares + float(np.square(residuals).sum()), count + residuals.size
-        step()
-    return math.sqrt(squares / count) if count else None
 
 
 def _supported(
@@ -345,7 +336,7 @@ class IntrinsicsResult:
     ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; all others were held fixed.  One per view:
     ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
     and ``used`` (n,).  ``criterion``: Bayesian information criterion of each model that was tried, the smallest is
-    best.
+    best.  ``displacement_m`` (m, 3): of the ``target``'s points from their places, if it isn't exact.
     """
 
     model: ModelName
@@ -360,6 +351,15 @@ class IntrinsicsResult:
     warnings: tuple[str, ...] = ()
     criterion: dict[str, float] | None = None
     cross_validated_rms_px: float | None = None
+    target: TargetPoints | None = None
+    displacement_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def where_they_are(self, sightings: Sequence[Sighting]) -> Sequence[Sighting]:
+        """Views of the same target, with its points where this fit found them."""
+        if self.target is None:
+            return sightings
+        found = TargetPoints.numbered(sightings, self.target.places_m)
+        return found.displaced(sightings, self.displacement_m)
 
     @property
     def view_rms_px(self) -> tuple[float, ...]:
@@ -391,7 +391,16 @@ def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
 
 def doubts_of(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> tuple[str, ...]:
     """What the views can't support, one line each."""
-    return (*_parameters(result), *_views(result, sightings))
+    return (*_target(result), *_parameters(result), *_views(result, sightings))
+
+
+def _target(result: IntrinsicsResult) -> list[str]:
+    if result.target is None:
+        return []
+    places_m, moved_m = result.target.places_m, result.displacement_m
+    off_mm = 1e3 * off_plane_m(places_m, moved_m)
+    uneven = f"the target isn't flat and exact: its points lie up to {off_mm:.2g} mm off a plane, alike in all images"
+    return [f"{uneven}; their places were estimated, too, and the ± includes it; a print on glass or metal is flat"]
 
 
 def _parameters(result: IntrinsicsResult) -> list[str]:

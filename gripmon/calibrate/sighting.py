@@ -29,7 +29,8 @@ class Sighting:
     positions on the target, in a right-handed frame with x along its columns and z *into* the plate, away from a camera
     that sees it; z = 0.  On a lattice without markers the origin may be any of its points, and x any of its directions.
     ``disc_radius_m`` is 0 for corners; for discs ``uv_px`` is the centroid of the visible blob, which under perspective
-    isn't the image of the disc's centre.
+    isn't the image of the disc's centre.  ``anchored``: ``plate_m`` is of the target's own origin, by its marks, or
+    since all of it is in the image.
     """
 
     uv_px: Array
@@ -40,6 +41,7 @@ class Sighting:
     disc_radius_m: float = 0.0
     name: str = ""
     note: str = ""
+    anchored: bool = False
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -47,7 +49,10 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Why no target was found; one line for a person.  ``larger``: one was found, but it has too many points."""
+    """Why no target was found; one line for a person.  ``larger``: one was found, but it has too many points;
+    ``smaller``: one that ends in the image all round, with too few.
+    """
 
     reason: str
     larger: bool = False
+    smaller: bool = False

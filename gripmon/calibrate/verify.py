@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from gripmon.calibrate.bundle import GivenCamera, independent_errors, lens_vector
+from gripmon.calibrate.bundle import GivenCamera, independent_errors
 from gripmon.calibrate.documents import CalibratedGripper
+from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
@@ -38,7 +39,8 @@ class Calibrated:
     """A calibration to compare, with its ``name``: a ``lens`` with the covariance of its ``parameters``, a
     ``cam_T_grip`` with ``covariance`` (36), or both; ``kind`` is where it comes from, ``target`` what it was
     made with, if that is known, ``notes`` describe its origin for people, ``pose_notes`` add to the transform's;
-    ``with_gripper``: the gripper file was made of the same images.
+    ``with_gripper``: the gripper file was made of the same images.  ``frame``: which one ``cam_T_grip`` is of, where
+    the file doesn't say where the TCP is in it; empty: the gripper's, at the TCP.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Calibrated:
     target: str | None = None
     notes: tuple[str, ...] = ()
     pose_notes: tuple[str, ...] = ()
+    frame: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +218,9 @@ def _hand_eyes(
     first: Calibrated, second: Calibrated, level: float, tolerance_m: float | None, tolerance_rad: float | None
 ) -> Verdict:
     assert first.cam_T_grip is not None and second.cam_T_grip is not None
+    if first.frame != second.frame:
+        of = " and ".join(f"{each.name} that of {each.frame or 'the TCP'}" for each in (first, second))
+        raise InputError(f"two poses of different frames: {of}; flange_T_tcp in the imported file")
     warnings = []
     if first.lens is not None and second.lens is not None and first.lens != second.lens:
         warnings.append("made with different camera calibrations, which may explain a difference")

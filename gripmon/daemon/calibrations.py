@@ -22,9 +22,17 @@ from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import foreign_camera, read_camera
 from gripmon.daemon.config.checks import covariance_of
 from gripmon.daemon.config.project import files_of
+from gripmon.daemon.config.robot_file import (
+    at_flange,
+    frame_without_tcp,
+    is_robot_reference,
+    reference_values,
+    robot_reference,
+    sure,
+    tcp_unknown,
+)
 from gripmon.daemon.config.typed import ConfigError
-from gripmon.daemon.config.yaml_file import kind_of, read_document, read_settings, read_yaml
-from gripmon.daemon.robot_file import is_robot_reference, reference_values, robot_reference
+from gripmon.daemon.config.yaml_file import GivenFile, kind_of, read_document, read_settings
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
 from gripmon.model.atomic import write_atomically
@@ -32,7 +40,7 @@ from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.images import LARGEST_BYTES, image_paths
+from gripmon.model.images import image_paths
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, FrameRecord, Transform
 from gripmon.model.targets import Target, refuse_other_size
@@ -48,52 +56,44 @@ _MOST_FOREIGN_BYTES = 1 << 24
 """Largest file that may be another program's."""
 
 
-def read_calibrated(path: Path) -> Calibrated:
+def read_calibrated(file: Path | GivenFile) -> Calibrated:
     """The calibration in a file.  :class:`~gripmon.model.errors.InputError` if there is none."""
-    data = read_bytes(path)
-    head = data[:4096].lstrip()
+    file = file if isinstance(file, GivenFile) else given_file(file)
+    path, head = file.path, file.data[:4096].lstrip()
     if head.startswith(b'{"sha256"'):
-        return _state(path, data)
+        return _state(path, file.data)
     if head.startswith(b"{") and path.suffix != ".yaml":
-        return _foreign(path, data) or _estimates(path, data)
+        return _foreign(file) or _estimates(path, file.data)
     try:
-        values = read_yaml(path)
+        values = file.values
     except ConfigError:
-        if (found := _foreign(path, data)) is None:
+        if (found := _foreign(file)) is None:
             raise
         return found
-    return _of_yaml(path, values, data)
+    return _of_yaml(file, values)
 
 
-def read_bytes(path: Path) -> bytes:
-    """A file's content; :class:`~gripmon.model.errors.InputError` if it can't be read."""
-    try:
-        if path.is_file() and path.stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path}: is larger than 1 GB; {_RIGHT}")
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; {_RIGHT}") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); {_RIGHT}") from None
+def given_file(path: Path) -> GivenFile:
+    """A file that an option names for its calibration."""
+    return GivenFile(path, _RIGHT)
 
 
-def _foreign(path: Path, data: bytes) -> Calibrated | None:
+def _foreign(file: GivenFile) -> Calibrated | None:
     """What another program's file holds; None if it is of none that is known."""
-    if len(data) > _MOST_FOREIGN_BYTES:
+    if len(file.data) > _MOST_FOREIGN_BYTES:
         return None
-    hand_eye = read_hand_eye(data, str(path))
-    if hand_eye is not None:
-        if hand_eye.doubt:
-            raise InputError(f"{path}: {hand_eye.doubt}; gripmon calibrate import if it hasn't")
-        return _robot(path, reference_values(hand_eye))
-    found = foreign_camera(path)
-    return None if found is None else Calibrated(str(path), "another program's camera", found.camera)
+    path, hand_eye = file.path, read_hand_eye(file.document)
+    if hand_eye is None:
+        found = foreign_camera(file)
+        return None if found is None else Calibrated(str(path), "another program's camera", found.camera)
+    return _robot(path, reference_values(sure(path, hand_eye)))
 
 
-def _of_yaml(path: Path, values: dict[str, object], data: bytes) -> Calibrated:
+def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
+    path = file.path
     readers = {"gripmon.camera_calibration/1": _camera, "gripmon.hand_eye_calibration/1": _hand_eye}
     if values.get("schema") in readers:
-        return readers[str(values["schema"])](path)
+        return readers[str(values["schema"])](file)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
     if is_robot_reference(values):
@@ -101,13 +101,13 @@ def _of_yaml(path: Path, values: dict[str, object], data: bytes) -> Calibrated:
     if "fx_px" in values:
         return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
     kind = kind_of(values)
-    if kind is None and (found := _foreign(path, data)) is not None:
+    if kind is None and (found := _foreign(file)) is not None:
         return found
     raise InputError(f"{path}: holds no calibration{f', it is {kind}' if kind else ''}; {_RIGHT}")
 
 
-def _camera(path: Path) -> Calibrated:
-    found = read_camera(path)
+def _camera(file: GivenFile) -> Calibrated:
+    found = read_camera(file)
     values = {**_plain(found.camera)}
     sigmas = [
         f"{name} {values[name]:.6g} ± {math.sqrt(max(found.covariance[i * (len(found.parameters) + 1)], 0.0)):.2g}"
@@ -117,7 +117,7 @@ def _camera(path: Path) -> Calibrated:
     if found.residuals is not None:
         notes.append(f"rms {found.residuals.rms_px:.3f} px over {found.residuals.points} points")
     return Calibrated(
-        str(path), "a camera calibration", found.camera, found.parameters, found.covariance, target=found.target,
+        str(file.path), "a camera calibration", found.camera, found.parameters, found.covariance, target=found.target,
         notes=tuple(notes),
     )  # fmt: skip
 
@@ -130,11 +130,11 @@ def _plain(camera: LensSettings) -> dict[str, float]:
     return values
 
 
-def _hand_eye(path: Path) -> Calibrated:
-    found = read_document(path, HandEyeCalibration)
+def _hand_eye(file: GivenFile) -> Calibrated:
+    found = read_document(file, HandEyeCalibration)
     residuals = found.residuals
     return Calibrated(
-        str(path),
+        str(file.path),
         "a hand/eye calibration",
         found.camera,
         cam_T_grip=found.cam_T_grip,
@@ -167,11 +167,12 @@ def _configuration(path: Path) -> Calibrated:
 
 
 def _robot(path: Path, values: dict[str, object]) -> Calibrated:
-    settings = robot_reference(path, values)
+    frame = frame_without_tcp(values)
+    settings = at_flange(path, values) if frame else robot_reference(path, values)
     told, covariance = settings.cam_T_grip, covariance_of(settings)
     return Calibrated(
         str(path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
-        covariance=covariance, pose_notes=tuple(_uncertainty(covariance)),
+        covariance=covariance, frame=frame, pose_notes=tuple(_uncertainty(covariance)),
     )  # fmt: skip
 
 
@@ -227,9 +228,10 @@ def _uncertainty(covariance: tuple[float, ...]) -> list[str]:
     return [f"one standard deviation along and about the camera's x, y, z: {mm} mm (TCP), {degrees} degrees"]
 
 
-def camera_in(path: Path) -> GivenCamera:
+def camera_in(file: Path | GivenFile) -> GivenCamera:
     """The camera in a file, with its covariance if the file has one.  :class:`~gripmon.model.errors.InputError`."""
-    found = read_calibrated(path)
+    found = read_calibrated(file)
+    path = found.name
     if found.lens is None:
         raise InputError(f"{path}: holds no camera; a file of gripmon calibrate intrinsics", "camera")
     try:
@@ -245,13 +247,21 @@ def pose_in(path: Path) -> tuple[Array, Array]:
     """``cam_T_grip`` (4, 4) in a file, and the covariance (6, 6) of its error.
     :class:`~gripmon.model.errors.InputError`.
     """
-    found = read_calibrated(path)
+    return pose_of(read_calibrated(path))
+
+
+def pose_of(found: Calibrated) -> tuple[Array, Array]:
+    """``cam_T_grip`` (4, 4) of a calibration, at the TCP, and the covariance (6, 6) of its error.
+    :class:`~gripmon.model.errors.InputError`.
+    """
     if found.cam_T_grip is None:
         raise InputError(
-            f"{path}: holds no cam_T_grip; a file of gripmon calibrate plane, a configuration, or cam_T_grip with "
-            "position_sigma_m and rotation_sigma_rad",
+            f"{found.name}: holds no cam_T_grip; a file of gripmon calibrate plane, a configuration, or cam_T_grip "
+            "with position_sigma_m and rotation_sigma_rad",
             "reference",
         )
+    if found.frame:
+        raise tcp_unknown(Path(found.name), found.frame)
     return from_record(found.cam_T_grip), np.reshape(found.covariance, (6, 6))
 
 
@@ -264,10 +274,11 @@ def view_in(
     gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
     camera, reference = files_of(camera=camera, reference=reference).values()
-    cam_T_grip = None if reference is None else pose_in(reference)[0]
+    given = None if reference is None else read_calibrated(reference)
+    cam_T_grip = None if given is None else pose_of(given)[0]
     lens = None if camera is None else camera_in(camera).lens
-    if lens is None and reference is not None:
-        lens = read_calibrated(reference).lens
+    if lens is None and given is not None:
+        lens = given.lens
     if rough is None:
         return None if lens is None else make_camera(lens), cam_T_grip
     if lens is None:
@@ -377,8 +388,7 @@ def measure_again(
         refuse_other_size(target, made.target, f"{made.name} was made with")
     opening_m = _opening(first, config, jaw_opening_m)
     paths = image_paths(images)
-    assert first.cam_T_grip is not None
-    expected = from_record(first.cam_T_grip), np.reshape(first.covariance, (6, 6))
+    expected = pose_of(first)
     lens = config.settings.camera
     if target is None:
         (cam_T_grip, covariance), doubts = measure_tracked(

@@ -12,8 +12,8 @@ from gripmon.calibrate.hand_eye_files import HandEye, write_hand_eye
 from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.interchange import FORMATS, Exported, write_camera
 from gripmon.calibrate.verify import Calibrated
-from gripmon.daemon.calibrations import read_bytes, read_calibrated
-from gripmon.daemon.robot_file import reference_values, robot_reference
+from gripmon.daemon.calibrations import given_file, read_calibrated
+from gripmon.daemon.config.robot_file import TCP, reference_values, robot_reference
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
@@ -32,8 +32,9 @@ def import_calibration(
     of a hand/eye transform.  Options as in :func:`~gripmon.calibrate.camera_files.read_camera`, ``which`` also of a
     hand/eye transform's frames; ``command`` is for the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
-    data, made = read_bytes(path), provenance_of(command, [path])
-    hand_eye = read_hand_eye(data, str(path), which=which)
+    file = given_file(path)
+    made = provenance_of(command, [file.input])
+    hand_eye = read_hand_eye(file.document, which=which)
     if hand_eye is not None:
         if size_px is not None or model is not None:
             raise InputError(f"{path}: is a hand/eye transform ({hand_eye.kind}); without --size and --model")
@@ -42,16 +43,17 @@ def import_calibration(
         notes = [f"{origin}, from {path.name}, SHA-256 {made.inputs[0].sha256}", f"written {made.time}: {made.command}"]
         x, y, z = (1e3 * invert(hand_eye.grip_T_cam)[:3, 3]).tolist()
         lines = [origin, f"{hand_eye.gripper_frame} is at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"]
-        if hand_eye.covariance is None:
-            tcp = f"if the TCP isn't at {hand_eye.gripper_frame} (x across the jaws, z out): flange_T_tcp in this file"
-            notes, lines = [*notes, tcp], [*lines, tcp]
-        else:
+        if hand_eye.at_tcp:
             robot_reference(path, values)  # whole: nothing is to be completed
+        else:
+            tcp = f"flange_T_tcp is to be filled in: where {TCP} is in {hand_eye.gripper_frame}"
+            example = "translation_m: [0.0, 0.0, 0.2], rotation_xyzw: [0.0, 0.0, 0.0, 1.0]"
+            notes, lines = [*notes, f"{tcp}, for example {{{example}}}"], [*lines, tcp]
         if hand_eye.doubt:
             notes, lines = [*notes, hand_eye.doubt], [*lines, f"warning: {hand_eye.doubt}"]
         text = "".join(f"# {note}\n" for note in notes) + as_yaml(values, inline=True)
         return text.encode(), lines
-    found = read_foreign_camera(data, str(path), which=which, size_px=size_px, model=model)
+    found = read_foreign_camera(file.document, which=which, size_px=size_px, model=model)
     camera, lens = found.camera, found.camera.__struct_config__.tag
     lines = [f"{found.kind}: {lens}, {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px"]
     unknown = f"imported from {found.kind}: its uncertainty is unknown"
@@ -86,9 +88,8 @@ def export_calibration(
     if source.cam_T_grip is None:
         right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
         raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
-    hand_eye = HandEye(
-        source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, name=name, **(frames or {})
-    )
+    names = {**({"gripper_frame": source.frame} if source.frame else {}), **(frames or {})}
+    hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, name=name, **names)
     return Exported(write_hand_eye(hand_eye, kind, (*_notes(source, command), *source.pose_notes)).encode())
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-from gripmon.calibrate.bundle import GivenCamera, lens_vector
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
 from gripmon.model.camera import Camera, LensSettings

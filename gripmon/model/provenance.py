@@ -38,14 +38,19 @@ class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     seed: Annotated[int | None, Meta(description="of what was drawn at random; null: nothing was")] = None
 
 
-def provenance_of(command: str, inputs: Sequence[Path] = (), seed: int | None = None) -> Provenance:
-    """Provenance of a file that is written now.  OSError for an input that can't be read."""
+def provenance_of(command: str, inputs: Sequence[Path | InputFile] = (), seed: int | None = None) -> Provenance:
+    """Provenance of a file that is written now.  OSError for an input that can't be read; one that has been read
+    before is an :class:`InputFile`.
+    """
     return Provenance(
         gripmon=__version__,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,
         versions={name: importlib.metadata.version(package) for name, package in _LIBRARIES.items()},
-        inputs=tuple(InputFile(file=str(path), sha256=sha256_of(path)) for path in inputs),
+        inputs=tuple(
+            each if isinstance(each, InputFile) else InputFile(file=str(each), sha256=sha256_of(each))
+            for each in inputs
+        ),
         seed=seed,
     )
 

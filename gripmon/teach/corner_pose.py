@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.bundle import GivenCamera, LensModel, lens_vector, model_of, parameter_names
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.lens_models import LensModel, lens_vector, model_of, parameter_names
 from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.calibrate.bundle import centre_offsets_px
+from gripmon.calibrate.lens_models import centre_offsets_px
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation
@@ -49,14 +49,19 @@ def seen(
     noise_px: float = 0.1,
     radius_m: float = 0.0,
     gross: float = 0.0,
+    displacement_m: Array | None = None,
+    anchored: bool = False,
 ) -> list[Sighting]:
-    """What a camera sees; a part ``gross`` of the points lies up to 30 px off."""
+    """What a camera sees; a part ``gross`` of the points lies up to 30 px off; ``displacement_m`` (63, 3): of the
+    plate's points from where they should be.
+    """
+    true_m = PLATE_M if displacement_m is None else PLATE_M + displacement_m
     camera, out = make_camera(settings), []
     size = (settings.width_px, settings.height_px)
     for k, T in enumerate(cam_T_plate):
-        uv = camera.project(PLATE_M @ T[:3, :3].T + T[:3, 3])
+        uv = camera.project(true_m @ T[:3, :3].T + T[:3, 3])
         if radius_m:
-            uv = uv + centre_offsets_px(camera, T, PLATE_M, radius_m)
+            uv = uv + centre_offsets_px(camera, T, true_m, radius_m)
         ok = np.isfinite(uv).all(axis=1) & (uv > 0).all(axis=1) & (uv < np.array(size) - 1).all(axis=1)
         if ok.sum() < 20:
             continue
@@ -64,5 +69,8 @@ def seen(
         wrong = rng.random(len(uv)) < gross
         uv[wrong] += rng.uniform(-30.0, 30.0, (wrong.sum(), 2))
         covariance = np.tile(noise_px**2 * np.eye(2), (len(uv), 1, 1))
-        out.append(Sighting(uv, PLATE_M[ok], covariance, np.flatnonzero(ok), size, radius_m, f"view {k}"))
+        name = f"view {k}"
+        out.append(
+            Sighting(uv, PLATE_M[ok], covariance, np.flatnonzero(ok), size, radius_m, name, anchored=anchored)
+        )
     return out

@@ -1,4 +1,6 @@
-"""Files of ``gripmon calibrate`` that a configuration may name instead of the sections ``camera`` and ``reference``."""
+"""Files of ``gripmon calibrate``, or of other programs, that a configuration may name in place of its sections
+``camera`` and ``reference``.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,9 @@ import msgspec
 from gripmon.calibrate import camera_files
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration
 from gripmon.calibrate.foreign import UnknownFormatError
+from gripmon.daemon.config.robot_file import named_reference
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import is_document, named_file, read_document
+from gripmon.daemon.config.yaml_file import GivenFile, named_file, read_document
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
@@ -21,7 +24,7 @@ from gripmon.model.response import Response
 from gripmon.track.edges.taught import gripper_digest
 
 _INTRINSICS = "a file of gripmon calibrate intrinsics or another program's camera"
-_PLANE = "a file of gripmon calibrate plane"
+_PLANE = "a file of gripmon calibrate plane or another program's hand/eye result"
 _OR = ", or a section"
 
 
@@ -44,47 +47,65 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
     if isinstance(values.get("camera"), str):
         paths["camera"] = named_file(path, "camera", values["camera"], _INTRINSICS, _OR)
         values["camera"] = _as_read(read_camera(paths["camera"]).camera)
-    if isinstance(values.get("reference"), str):
-        paths["reference"] = named_file(path, "reference", values["reference"], _PLANE, _OR)
-        hand_eye = read_document(paths["reference"], HandEyeCalibration)
-        values["reference"] = {
-            "cam_T_grip": _as_read(hand_eye.cam_T_grip),
-            "covariance": list(hand_eye.covariance),
-            "with_gripper": hand_eye.with_gripper,
-        }
+    reference = values.get("reference")
+    named = {"hand_eye": reference} if isinstance(reference, str) else reference
+    if isinstance(named, dict) and "hand_eye" in named:
+        paths["reference"], hand_eye, values["reference"] = _named_reference(path, named)
     return values, CalibrationFiles(paths, hand_eye)
 
 
-def read_camera(path: Path) -> CameraCalibration:
+def _named_reference(config: Path, section: dict[str, Any]) -> tuple[Path, HandEyeCalibration | None, dict[str, Any]]:
+    """The file that ``hand_eye`` of a section names, its content if it is gripmon's, and the section that both say."""
+    beside = {key: value for key, value in section.items() if key != "hand_eye"}
+    name = section["hand_eye"]
+    if not isinstance(name, str):
+        raise ConfigError(config, "reference.hand_eye", f"is {name!r}", _PLANE)
+    file = GivenFile(named_file(config, "reference", name, _PLANE, _OR))
+    if not file.own:
+        return file.path, None, _as_read(named_reference(config, file, beside))
+    if beside:
+        wrong = f"stands beside {name}, a file of gripmon's that says it"
+        raise ConfigError(config, f"reference.{next(iter(beside))}", wrong, f"reference: {name}")
+    made = read_document(file, HandEyeCalibration)
+    return file.path, made, {
+        "cam_T_grip": _as_read(made.cam_T_grip),
+        "covariance": list(made.covariance),
+        "with_gripper": made.with_gripper,
+    }  # fmt: skip
+
+
+def read_camera(file: Path | GivenFile) -> CameraCalibration:
     """A calibrated camera, in a file of gripmon calibrate or of another program.  Raises :class:`ConfigError`, for
     another program's file :class:`~gripmon.model.errors.InputError`.
     """
-    foreign = foreign_camera(path)
+    file = file if isinstance(file, GivenFile) else GivenFile(file)
+    foreign = foreign_camera(file)
     if foreign is not None:
         return foreign
-    calibration = read_document(path, CameraCalibration)
+    calibration = read_document(file, CameraCalibration)
     count = len(calibration.parameters)
     if len(calibration.covariance) != count * count:
         wrong = f"has {len(calibration.covariance)} values for {count} parameters"
-        raise ConfigError(path, "covariance", wrong, f"{count * count} values, row by row")
+        raise ConfigError(file.path, "covariance", wrong, f"{count * count} values, row by row")
     return calibration
 
 
-def foreign_camera(path: Path) -> CameraCalibration | None:
+def foreign_camera(file: GivenFile) -> CameraCalibration | None:
     """The camera in another program's file, exact; None for a file of gripmon's.
     :class:`~gripmon.model.errors.InputError` also where ``gripmon calibrate import`` would only warn.
     """
-    if is_document(path) or not path.is_file():
+    path = file.path
+    if file.own:
         return None
     try:
-        found = camera_files.read_camera(path.read_bytes(), str(path))
-    except (OSError, UnknownFormatError):  # the reader of gripmon's own files says why it can't be read
+        found = camera_files.read_camera(file.document)
+    except UnknownFormatError:  # the reader of gripmon's own files says what it is
         return None
     if found.warnings:
         raise InputError(f"{path}: {found.warnings[0]}; gripmon calibrate import with --model brown_conrady or fisheye")
     return CameraCalibration(
         camera=found.camera, parameters=(), covariance=(), warnings=(f"{found.kind}: its uncertainty is unknown",),
-        provenance=provenance_of(f"read from {path.name}, a file of {found.kind}", [path]),
+        provenance=provenance_of(f"read from {path.name}, a file of {found.kind}", [file.input]),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.hand_eye_formats import BODY_AXES, lies_along_x
+from gripmon.calibrate.hand_eye_formats import BODY_AXES, FARTHEST_M, lies_along_x, meant
 from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
@@ -39,8 +39,7 @@ from gripmon.monitor import MonitorSettings
 _log = logging.getLogger(__name__)
 
 NEAREST_M = 0.005
-FARTHEST_M = 5.0
-"""Range of the TCP's depth and distance in front of the camera: beyond it, another unit was meant."""
+"""Least depth of the TCP in front of the camera: below it, another unit was meant."""
 FEWEST_CORNERS_IN_VIEW = 3
 
 _IN_FRONT = (
@@ -77,8 +76,7 @@ def reference_transform(settings: ReferenceSettings) -> Array:
     distance_m, depth_m = float(np.linalg.norm(translation_m)), float(translation_m[2])
     wrong, right = "", "metres, e.g. [0.0, 0.0, 0.12]"
     if distance_m > FARTHEST_M:
-        unit = f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
-        wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({unit})"
+        wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({meant(distance_m)})"
     elif depth_m < NEAREST_M and lies_along_x(translation_m):
         wrong, right = f"puts the TCP {_ALONG_X}", _OPTICAL
     elif depth_m <= 0.0:

@@ -30,6 +30,8 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
     Raises :class:`ConfigError` for a file that no longer exists.
     """
     named = {"gripper": config.gripper_path, **config.calibrated.paths}
+    if config.calibrated.hand_eye is None:  # a section, or a robot's file: the settings hold all that it says
+        named.pop("reference", None)
     if config.taught is not None and config.taught_path is not None:
         named["taught"] = config.taught_path
     values = _plain(config)

@@ -3,32 +3,83 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
 import gripmon
+from gripmon.calibrate.foreign import Document, InterchangeError
 from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
+from gripmon.model.errors import InputError
 from gripmon.model.fields import described
+from gripmon.model.images import LARGEST_BYTES
+from gripmon.model.provenance import InputFile
 from gripmon.model.yaml_text import YamlFault, parse_yaml, plain_value
 
 _T = TypeVar("_T")
 _LINES, _SEE = "`key: value` lines, indented with blanks", "`key: value` lines; see configs/demo.yaml"
 
 
+class GivenFile:
+    """A file that an option or a key names, which may be gripmon's or another program's: read once, parsed once.
+    ``right``: what it should be.  :class:`ConfigError` where it is asked for something that it hasn't.
+    """
+
+    def __init__(self, path: Path, right: str = "the path of a YAML file") -> None:
+        self.path, self._right = path, right
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @functools.cached_property
+    def data(self) -> bytes:
+        """Its bytes."""
+        try:
+            if self.path.is_file() and self.path.stat().st_size > LARGEST_BYTES:
+                raise ConfigError(self.path, "", "is larger than 1 GB", self._right)
+            return self.path.read_bytes()
+        except FileNotFoundError:
+            raise ConfigError(self.path, "", "there is no such file", self._right) from None
+        except IsADirectoryError:
+            raise ConfigError(self.path, "", "is a folder", self._right) from None
+        except OSError as error:
+            raise ConfigError(self.path, "", f"can't be read ({error.strerror})", self._right) from None
+
+    @functools.cached_property
+    def document(self) -> Document:
+        """The same for readers of other programs' files."""
+        return Document(str(self.path), self.data)
+
+    @property
+    def own(self) -> bool:
+        """Whether it has a ``schema``, as files of gripmon's have."""
+        with contextlib.suppress(InputError):
+            return "schema" in self.document.content
+        return False
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The mapping in YAML."""
+        try:
+            return _mapping(self.path, self.document.text)
+        except InterchangeError as error:
+            raise ConfigError("", "", str(error)) from None
+
+    @property
+    def input(self) -> InputFile:
+        """For the provenance of what is made of it."""
+        return InputFile(file=str(self.path), sha256=hashlib.sha256(self.data).hexdigest())
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file.  :class:`ConfigError` if unreadable, not YAML, not a mapping, or with a key twice."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(path, "", "there is no such file", "the path of a YAML file") from None
-    except IsADirectoryError:
-        raise ConfigError(path, "", "is a folder", "the path of a YAML file") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(path, "", f"is not text (byte {error.start} is not UTF-8)", "a YAML file") from None
-    except OSError as error:
-        raise ConfigError(path, "", f"can't be read ({error.strerror})", "a readable YAML file") from None
+    return GivenFile(path).values
+
+
+def _mapping(path: Path, text: str) -> dict[str, Any]:
     try:
         value = parse_yaml(text)
     except YamlFault as fault:
@@ -122,16 +173,10 @@ def _other_kind(values: dict[str, Any], wanted: type) -> tuple[str, str] | None:
     return None if mark is None or mark in values else (f"is {given}", _LOOKS_LIKE[mark])
 
 
-def is_document(path: Path) -> bool:
-    """Whether a file has a ``schema``, as those of gripmon have."""
-    with contextlib.suppress(ConfigError):
-        return "schema" in read_yaml(path)
-    return False
-
-
-def read_document(path: Path, kind: type[_T]) -> _T:
+def read_document(file: Path | GivenFile, kind: type[_T]) -> _T:
     """The content of a file with a ``schema`` as that type.  :class:`ConfigError`."""
-    values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
+    file = file if isinstance(file, GivenFile) else GivenFile(file)
+    path, values, tag = file.path, file.values, str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
     schema, given, wanted = values.get("schema"), kind_of(values), _SCHEMAS[tag.partition("/")[0]]
     if schema == tag:
         return read_settings(path, kind, values)

@@ -19,8 +19,8 @@ from gripmon.calibrate.lattice import to_bytes, to_grey
 from gripmon.calibrate.target_print import print_target
 from gripmon.daemon.config import read_gripper
 from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.robot_file import reference_text
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.daemon.robot_file import reference_text
 from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import target_in

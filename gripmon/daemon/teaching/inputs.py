@@ -14,14 +14,14 @@ from pathlib import Path
 import cv2
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.daemon.calibrations import camera_in, pose_in, read_calibrated
+from gripmon.daemon.calibrations import camera_in, given_file, pose_of, read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch
 from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.project import file_of, files_of
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
-from gripmon.daemon.config.yaml_file import is_document, read_settings, read_yaml
+from gripmon.daemon.config.yaml_file import GivenFile, read_settings, read_yaml
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, SourceSettings
 from gripmon.model.camera import Camera, make_camera
@@ -89,6 +89,7 @@ def read_inputs(
     cv2.setNumThreads(1)
     camera, gripper, reference = files_of(camera=camera, gripper=gripper, reference=reference).values()
     given = None
+    named = {key: given_file(path) for key, path in (("camera", camera), ("reference", reference)) if path is not None}
     if config is not None:
         given = load_config(config, check_source=False, with_taught=False)
         setup = Setup(given.camera, given.gripper, given.settings.monitor, given.reference)
@@ -98,7 +99,7 @@ def read_inputs(
             jaw_opening_m = given.jaw_opening_m
     else:
         model, gripper_path = _gripper(gripper)
-        setup = Setup(*_calibrations(camera, reference, model))
+        setup = Setup(*_calibrations(named, model))
     if jaw_source is not None and not setup.gripper.has_jaw:
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = setup.settings.bit_depth
@@ -120,7 +121,6 @@ def read_inputs(
             frames = FolderSettings(path=str(images[0].parent))
     except SourceError as error:
         raise InputError(str(error), "source") from None
-    calibrations = {"camera": camera, "reference": reference}
     return Inputs(
         setup=setup,
         pictures=pictures,
@@ -132,7 +132,7 @@ def read_inputs(
         camera_name=camera_name or CAMERA_NAME,
         command=command,
         live=live,
-        calibrations={key: path for key, path in calibrations.items() if path and is_document(path)},
+        calibrations={key: file.path for key, file in named.items() if file.own},
         jaw_source=jaw_source,
         response=light,
     )
@@ -183,14 +183,14 @@ def _gripper(path: Path | None) -> tuple[Gripper, Path]:
 
 
 def _calibrations(
-    camera_path: Path | None, reference_path: Path | None, gripper: Gripper
+    named: dict[str, GivenFile], gripper: Gripper
 ) -> tuple[Camera, Gripper, MonitorSettings, ReferenceRecord | None, GivenCamera]:
     """Camera, gripper, settings and reference from files; a reference's file may also contain its camera."""
-    given = None if camera_path is None else camera_in(camera_path)
+    given = camera_in(named["camera"]) if "camera" in named else None
     reference = None
-    if reference_path is not None:
-        pose_in(reference_path)  # says what a file without one holds
-        found = read_calibrated(reference_path)
+    if "reference" in named:
+        found = read_calibrated(named["reference"])
+        pose_of(found)  # says what a file without one holds
         given = given or (None if found.lens is None else GivenCamera(found.lens))
         assert found.cam_T_grip is not None
         reference = configured(found.cam_T_grip, found.covariance, with_gripper=found.with_gripper)
@@ -198,13 +198,13 @@ def _calibrations(
         if fault is not None:
             wrong = fault.wrong.replace("the configuration's camera", "the one given")
             wrong = wrong.replace("the configuration has", "the one given is")
-            raise InputError(f"{reference_path}: {fault.key}: {wrong}; {fault.right}", "reference")
+            raise InputError(f"{found.name}: {fault.key}: {wrong}; {fault.right}", "reference")
     if given is None:
         right = "a file of gripmon calibrate intrinsics, or a configuration"
         raise InputError(f"is missing; {right}", "camera")
     camera = make_camera(given.lens)
     if reference is not None:
-        _check_view(camera, gripper, reference, str(reference_path))
+        _check_view(camera, gripper, reference, found.name)
     return camera, gripper, MonitorSettings(), reference, given
 
 

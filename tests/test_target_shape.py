@@ -1,0 +1,108 @@
+"""Targets that aren't flat: fitted with their shape, or with an error that covers it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.sightings import CAMERAS, PLATE_M, poses, seen
+
+from gripmon.calibrate.bundle import BundleProblem
+from gripmon.calibrate.cross_validation import cross_validate, with_scatter
+from gripmon.calibrate.intrinsics import IntrinsicsResult, calibrate
+from gripmon.calibrate.lens_models import LensModel, lens_vector
+from gripmon.calibrate.sighting import Sighting
+from gripmon.calibrate.target_shape import TargetPoints, off_plane_m
+from gripmon.model.geometry import exp_rotation
+from gripmon.model.records import Array
+
+MODEL = "brown_conrady"
+CAMERA = CAMERAS[MODEL]
+TRUE = lens_vector(CAMERA)
+X, Y = (PLATE_M[:, k] / PLATE_M[:, k].max() - 0.5 for k in (0, 1))
+TWISTED = np.stack([0 * X, 0 * X, 0.002 * X * Y + 0.0006 * X**2], axis=1)
+"""Its corners lie half a millimetre off a plane: a sheet of 160 x 120 mm on a box."""
+
+
+def leaning(rng: np.random.Generator, count: int) -> list[Array]:
+    """A plate that leans backward in all images, as one that stands on a table does."""
+    out = poses(rng, count)
+    for T in out:
+        middle = T[:3, :3] @ PLATE_M.mean(axis=0) + T[:3, 3]
+        T[:3, :3] = exp_rotation(np.array([rng.uniform(0.45, 0.9), *rng.uniform(-0.3, 0.3, 2)]))
+        T[:3, 3] = middle - T[:3, :3] @ PLATE_M.mean(axis=0)
+    return out
+
+
+def twisted(seed: int, *, anchored: bool, count: int = 16) -> list[Sighting]:
+    rng = np.random.default_rng(seed)
+    held = leaning(rng, count)
+    return seen(CAMERA, held, rng, noise_px=0.05, displacement_m=TWISTED, anchored=anchored)
+
+
+def in_sigmas(found: IntrinsicsResult) -> Array:
+    """Errors of the pinhole's four parameters over their standard deviations."""
+    return (lens_vector(found.camera) - TRUE)[:4] / np.sqrt(found.covariance.diagonal())[:4]
+
+
+def test_a_twisted_target_gives_the_camera_and_its_own_shape():
+    """With an exact one assumed, the same images are wrong by ten of their standard deviations."""
+    squares = []
+    for seed in range(4):
+        views = twisted(seed, anchored=True)
+        found = calibrate(views, MODEL)
+        assert found.target is not None and 0.04 < found.rms_px < 0.055
+        assert any("isn't flat and exact" in warning for warning in found.warnings)
+        off_m = off_plane_m(found.target.places_m, found.displacement_m)
+        assert off_m == pytest.approx(off_plane_m(PLATE_M, TWISTED), rel=0.1)
+        error = lens_vector(found.camera)[list(range(8))] - TRUE
+        squares.append(error @ np.linalg.solve(found.covariance, error) / len(error))
+    assert 0.4 < np.mean(squares) < 1.95  # 32 degrees of freedom: 0.42 to 1.93 in 99.9 %
+    flat = calibrate(twisted(0, anchored=True), MODEL, exact_target=True)
+    assert np.abs(in_sigmas(flat)).max() > 10.0
+
+
+def test_an_exact_target_is_taken_for_one():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        views = seen(CAMERA, leaning(rng, 12), rng, noise_px=0.05, anchored=True)
+        found = calibrate(views, MODEL)
+        assert found.target is None and not any("flat" in warning for warning in found.warnings)
+        again = with_scatter(found, cross_validate(views, MODEL), views)
+        assert np.array_equal(again.covariance, found.covariance) and again.warnings == found.warnings
+
+
+def test_where_the_images_dont_tell_which_point_is_which_the_error_is_enlarged():
+    """By what parts of the views differ; what is wrong in all of them alike doesn't show in that."""
+    for seed in range(2):
+        views = twisted(seed, anchored=False)
+        found = calibrate(views, MODEL)
+        assert found.target is None and np.abs(in_sigmas(found)).max() > 5.0
+        covered = with_scatter(found, cross_validate(views, MODEL), views)
+        assert np.abs(in_sigmas(covered)).max() < 0.4 * np.abs(in_sigmas(found)).max()
+        assert any("differ more than their errors allow" in warning for warning in covered.warnings)
+
+
+def test_views_that_had_no_part_in_the_fit_have_the_shape_that_was_found_without_them():
+    views = twisted(0, anchored=True)
+    assert cross_validate(views, MODEL).rms_px == pytest.approx(0.05, rel=0.1)
+
+
+def test_the_right_hand_side_is_the_costs_slope():
+    """Of all unknowns: lens, poses, displacements."""
+    views = twisted(1, anchored=True, count=4)
+    model = LensModel(MODEL, *views[0].size_px)
+    target = TargetPoints.of(views)
+    assert target is not None
+    problem, rng = BundleProblem(model, views, np.eye(8), target=target), np.random.default_rng(0)
+    at = TRUE, [T.copy() for T in calibrate(views, MODEL).cam_T_plate], rng.normal(0.0, 1e-4, (63, 3))
+    weights = [np.linspace(0.2, 1.0, len(view)) for view in views]
+    normal, side = problem._equations(at, weights)
+    assert np.allclose(normal, normal.T) and len(side) == 8 + 6 * 4 + 3 * 63
+    for k in (0, 3, 5, *rng.integers(0, 3 * 63, 12) + 8 + 6 * 4):
+        step = np.zeros(len(side))
+        step[k] = 1e-7 if k > 7 else 1e-4 * max(abs(TRUE[k]), 1e-2)
+        costs = [
+            problem._cost((at[0] + s * step[:8], at[1], at[2] + s * step[8 + 24 :].reshape(-1, 3)), weights)
+            for s in (1.0, -1.0)
+        ]
+        assert (costs[1] - costs[0]) / (4.0 * step[k]) == pytest.approx(side[k], rel=1e-4)
