@@ -40,7 +40,8 @@ def test_every_command_has_its_help_on_the_page():
     from pages import commands
 
     page = commands.page()
-    names = re.findall(r"^    ([a-z]+)(?: |$)", _help().split("commands:")[1].split("\n\n")[0], re.MULTILINE)
+    listed = _help().split("start:")[1].split("options:")[0]
+    names = re.findall(r"^  ([a-z]+)(?: |$)", listed, re.MULTILINE)
     below = re.findall(r"^    ([a-z-]+)(?: |$)", _help("calibrate").partition("\n\n")[2], re.MULTILINE)
     assert len(names) >= 17 and len(below) >= 7
     for name in [f"gripmon {name}" for name in names] + [f"gripmon calibrate {name}" for name in below]:

@@ -17,6 +17,7 @@ from gripmon.cli.render import columns, lines, table
         ({"same": True, "why": None, "names": []}, ["same   yes", "why    -", "names  -"]),
         ({"limit_m": None}, ["limit  -"]),
         ({"drift_m": -0.0}, ["drift  0 mm"]),
+        ({"covariance": [0.5] * 36}, ["covariance  36 numbers, in --json"]),
         ({"shift_m": {"x": [0.001, 0.002], "y": 0.003}}, ["shift  x 1 2 mm, y 3 mm"]),
         ({"pose": {"tcp_m": [0.001], "rotation_rad": [0.0]}}, ["pose  TCP 1 mm, rotation 0°"]),
         ({"notes": ["two words", None]}, ["notes", "  two words", "  -"]),

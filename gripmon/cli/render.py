@@ -17,6 +17,8 @@ _WORDS = {"tcp": "TCP", "rms": "RMS"}
 _NOTHING = "-"
 _LONGEST = 110
 """Characters of a line up to which the values of a mapping share it."""
+_MOST = 20
+"""Numbers of a list that a person may read in a line; a covariance has 36."""
 
 
 def lines(values: Mapping[str, Any]) -> list[str]:
@@ -77,8 +79,10 @@ def _short(key: str, value: Any, outer: tuple[float, str]) -> str | None:
         return text if len(inside) == len(value) and None not in inside.values() and len(text) <= _LONGEST else None
     if isinstance(value, list | tuple) and any(isinstance(each, Mapping) or " " in str(each) for each in value):
         return None
+    if isinstance(value, list | tuple) and len(value) > _MOST:
+        return f"{len(value)} numbers, in --json"
     text = _cell(value, unit[0])
-    return text if text.strip("-, ") == "" or isinstance(value, bool | str) else text + unit[1]
+    return text if text.strip("- ") == "" or isinstance(value, bool | str) else text + unit[1]
 
 
 def _cell(value: Any, factor: float = 1.0) -> str:
