@@ -27,9 +27,6 @@ _BEHIND_DN = 120.0
 """Grey value where a ray doesn't meet the plate's plane in front of the camera."""
 _BAND_ROWS = 32
 """Rows of samples that are drawn at once: what is between stays in the processor's cache."""
-_MODULE_TEXELS = 16
-"""Texels along a module of a ChArUco board's markers: borders are exact, only corners are slightly rounded."""
-
 Grey = NDArray[np.float32]
 
 
@@ -229,39 +226,28 @@ def _box(grid: _Grid, low_m: float, high_m: tuple[float, float]) -> Array:
 
 def _marks(target: Charuco, grid: _Grid) -> Array:
     """Only the markers in the white squares: they don't touch the squares' borders."""
-    distances, modules = _mark_distances(target)
-    module_m, tile = target.marker_m / modules, (modules + 2) * _MODULE_TEXELS
+    dark = _modules(target)
+    modules = dark.shape[1] - 2
     i, j = np.floor(grid.x / target.square_m), np.floor(grid.y / target.square_m)
     white = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows) & ((i + j) % 2 == 1)
-    number = np.where(white, (j * target.columns + i) // 2, 0)
-    # From the marker's first module, with one module of white around it.
-    u, v = (
-        np.clip((value - (whole + 0.5) * target.square_m) / module_m + 0.5 * modules, -1.0, modules + 1.0)
-        for value, whole in ((grid.x, i), (grid.y, j))
-    )
-    at_u = np.nan_to_num((u + 1.0) * _MODULE_TEXELS - 0.5).astype(np.float32)
-    at_v = np.nan_to_num(number * tile + (v + 1.0) * _MODULE_TEXELS - 0.5).astype(np.float32)
-    slope_v, slope_u = (np.asarray(slope, np.float32) for slope in np.gradient(distances))
-    distance, nx, ny = (cv2.remap(m, at_u, at_v, cv2.INTER_LINEAR) for m in (distances, slope_u, slope_v))
-    size = np.maximum(_length(nx, ny), 1e-6)
-    depth_m = distance / _MODULE_TEXELS * module_m
-    return np.where(white, _covered(depth_m / grid.step(nx / size, ny / size)), 0.0)
+    number = np.where(white, (j * target.columns + i) // 2, 0).astype(int)
+    sides = []
+    for value, whole, step in zip((grid.x, grid.y), (i, j), grid.steps, strict=True):
+        at = (value - (whole + 0.5) * target.square_m) * modules / target.marker_m + 0.5 * modules + 1.0
+        border = np.clip(np.rint(np.nan_to_num(at)), 1, modules + 1)  # the nearest one between two modules
+        beyond = _covered((at - border) * target.marker_m / modules / step)
+        sides.append(((border.astype(int) - 1, 1.0 - beyond), (border.astype(int), beyond)))
+    columns, rows = sides
+    return white * sum(dark[number, v, u] * share_v * share_u for u, share_u in columns for v, share_v in rows)
 
 
 @functools.lru_cache(maxsize=2)
-def _mark_distances(target: Charuco) -> tuple[Grey, int]:
-    """Distances in texels from each texel to the nearest border of a marker's dark part, positive inside, with the
-    markers stacked vertically; and the number of modules along a marker's side.
-    """
+def _modules(target: Charuco) -> NDArray[np.bool_]:
+    """Which modules (markers, rows, columns) are dark, with one of white around each marker."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    modules = dictionary.markerSize + 2
-    marks = []
-    for number in range(target.columns * target.rows // 2):
-        bits = np.pad(dictionary.generateImageMarker(number, modules) < 128, 1)
-        dark = np.kron(bits, np.ones((_MODULE_TEXELS, _MODULE_TEXELS), np.uint8)).astype(np.uint8)
-        inside, outside = (cv2.distanceTransform(part, cv2.DIST_L2, 5) for part in (dark, 1 - dark))
-        marks.append(np.where(dark > 0, inside - 0.5, 0.5 - outside))
-    return np.concatenate(marks).astype(np.float32), modules
+    size = dictionary.markerSize + 2
+    marks = (dictionary.generateImageMarker(number, size) for number in range(target.columns * target.rows // 2))
+    return np.array([np.pad(mark < 128, 1) for mark in marks])
 
 
 def _shift(target: Chequerboard | Charuco, errors_m: Array, grid: _Grid) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from gripmon.simulate.scenario import Background, FingerLook, JawScript, Light, 
 from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.straight_pieces import Chain
 from support.kept import kept
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+from support.simulated import BOX_FINGERS, PAPER_LENS
 
 CAMERA = make_camera(PAPER_LENS)
 
@@ -50,8 +50,7 @@ def moving_robot(
         light=light or Light(),
         jaw=JawScript(knots=() if opening_m is None else ((0.0, opening_m),)),
     )
-    pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
-    return paper_rig(gripper or read_gripper(BOX_FINGERS), pose).simulator(scenario, seed)
+    return paper_rig(gripper or read_gripper(BOX_FINGERS), cam_T_grip).simulator(scenario, seed)
 
 
 def images_of(simulator: Simulator, count: int = 30) -> list[NDArray[np.uint8]]:

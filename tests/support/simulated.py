@@ -12,12 +12,9 @@ import yaml
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.model.gripper import Gripper
-from gripmon.simulate import PAPER_LENS, Scenario, Simulator, paper_rig
-from gripmon.simulate import paper_cam_T_grip as nominal_cam_T_grip
+from gripmon.simulate import PAPER_LENS, Scenario, Simulator, paper_cam_T_grip, paper_rig
 from gripmon.simulate.scenario import Background, FingerLook, Sensor
 from support.grippers import gripper_from_dict
-
-__all__ = ["PAPER_LENS", "nominal_cam_T_grip"]
 
 BOX_FINGERS = Path(__file__).resolve().parents[2] / "configs" / "grippers" / "two_box_fingers.yaml"
 STRONG_LENS = BrownConradyLens(
@@ -29,6 +26,7 @@ STRONG_LENS = BrownConradyLens(
     cy_px=290.6,
     coefficients=(-0.32, 0.11, 0.0015, -0.001),
 )
+nominal_cam_T_grip = paper_cam_T_grip
 PLAIN_TABLE = Background(kind="plain", contrast=0.0, level_dn=180.0, boxes=0, cables=0, motion="still")
 PLAIN_FINGERS = FingerLook(texture=0.0, carriers=False)
 IDEAL_SENSOR = Sensor(read_noise_dn=0.0, shot_noise_dn=0.0, vignetting=0.0, exposure_time_s=0.0)
