@@ -15,13 +15,11 @@ from support.simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.jaw_travel import over_jaw
 from gripmon.teach.visibility import (
-    FEWEST_CORNERS,
     Freedom,
     Rig,
     behind_another_finger,
@@ -82,10 +80,6 @@ def enough_by_brute_force(lens: LensSettings, gripper: Gripper, cam_T_grip: np.n
         seen += not any(h < 1.0 - 1e-4 for h in hits if np.isfinite(h) and h > 0.0)
     layout = lay_out(make_camera(lens), gripper, cam_T_grip, opening_m, MonitorSettings().corners.sampling)
     return seen >= 3 and len(layout.edges) >= 3
-
-
-def test_enough_corners_are_as_many_as_a_configuration_needs():
-    assert FEWEST_CORNERS == FEWEST_CORNERS_IN_VIEW
 
 
 def test_points_behind_another_finger_are_those_whose_ray_meets_a_triangle_of_it():

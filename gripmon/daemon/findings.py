@@ -259,12 +259,12 @@ def _promise(report: Forecast, found: Kept | None, what: str) -> Finding | None:
         return None
     limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
     sure = max(bound.position_m / limit_m, bound.rotation_rad / limit_rad) * USUAL_SPREAD <= 1.0
-    text = f"forecast without images (--images gives what frames keep): {report.promise}"
+    text = f"forecast without images (--images gives what frames keep){report.promise.removeprefix('forecast')}"
     if report.reachable and bevelled and (bevelled.position_m > limit_m or bevelled.rotation_rad > limit_rad):
         good, sure = f"{in_mm(bevelled.position_m)} mm and {in_degrees(bevelled.rotation_rad)}°", False
         text += (
-            f"; so if all edges are as sharp as the gripper file says, to {good} with bevels of "
-            f"{in_mm(UNTOLD_BEVEL_M)} mm: teach them (gripmon teach), or state them (bevel_m)"
+            "; that holds if all edges are as sharp as the gripper file says, with bevels of "
+            f"{in_mm(UNTOLD_BEVEL_M)} mm it is good to {good}: teach them (gripmon teach), or state them (bevel_m)"
         )
     return Finding("OK" if sure else "WARN", "promise", text)
 

@@ -199,7 +199,7 @@ def forecast(config: Config) -> Forecast:
         alert_limit_rad=policy.alert_limit_rad,
         reachable=found is not None and found.reachable,
         needed=None if found is None or found.reachable else found.needed(),
-        promise="nothing: too little is in view" if found is None else found.promise(),
+        promise="nothing: too little is in view" if found is None else f"forecast: {found.promise()}",
         in_view=in_view,
         doubt=reference_doubt(settings),
     )

@@ -115,7 +115,7 @@ class RecalibrationForecast(msgspec.Struct, frozen=True):
 class Accuracy(msgspec.Struct, frozen=True):
     """What is expected of a frame that measures all visible edges; None if too few of them are visible.
 
-    ``covariance`` (6 x 6, row by row) as it would be published; ``since_reference`` and ``absolute``: both protection
+    ``tcp_sigma_m``: of the TCP along its least certain direction; ``since_reference`` and ``absolute``: both protection
     levels in front of clutter; ``jaw``: the effect of an unknown opening, also None without a jaw or where not asked
     for.
     """
@@ -132,7 +132,7 @@ class Accuracy(msgspec.Struct, frozen=True):
     ) = None
     jaw: JawAccuracy | None = None
     drift: DriftForecast | None = None
-    covariance: tuple[float, ...] | None = None
+    tcp_sigma_m: float | None = None
     since_reference: Protection | None = None
     absolute: Protection | None = None
 
@@ -140,13 +140,6 @@ class Accuracy(msgspec.Struct, frozen=True):
     def enough(self) -> bool:
         """Whether anything can be measured at all."""
         return self.edges >= self.edges_needed
-
-    @property
-    def tcp_sigma_m(self) -> float | None:
-        """Standard deviation of the TCP along its least certain direction."""
-        if self.covariance is None:
-            return None
-        return float(np.sqrt(np.linalg.eigvalsh(np.reshape(self.covariance, (6, 6))[:3, :3])[-1]))
 
     def by(self, valid_by: ValidBy) -> Protection | None:
         """The protection level that a setting names."""
@@ -188,7 +181,7 @@ def forecast_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, 
         weakest=PoseValues.of(weakest_direction(covariance, lever_m)),
         jaw=jaw,
         drift=_drift(rig, covariance),
-        covariance=tuple(covariance.ravel().tolist()),
+        tcp_sigma_m=float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
         since_reference=both.since_reference,
         absolute=both.absolute,
     )

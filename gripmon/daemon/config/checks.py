@@ -35,12 +35,12 @@ from gripmon.model.geometry import UNIT_TOLERANCE, invert, make_transform, rotat
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord, Transform, ValidBy, to_json
 from gripmon.monitor import MonitorSettings
+from gripmon.teach.visibility import FEWEST_CORNERS
 
 _log = logging.getLogger(__name__)
 
 NEAREST_M = 0.005
 """Least depth of the TCP in front of the camera: below it, another unit was meant."""
-FEWEST_CORNERS_IN_VIEW = 3
 
 _IN_FRONT = (
     "z > 0 in front of the camera: cam_T_grip maps gripper coordinates to camera coordinates (the inverse was given?)"
@@ -212,12 +212,12 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
             f"fingertips in {camera.width_px} x {camera.height_px} px (x right, y down, z forward; x, y, z, w)",
         )
     seen = int(view.visible.sum())
-    if seen < FEWEST_CORNERS_IN_VIEW:
+    if seen < FEWEST_CORNERS:
         names = ", ".join(c for c, v in zip(gripper.landmark_ids, view.visible, strict=True) if v) or "none"
         return Fault(
             key,
             f"shows {seen} corners ({names})",
-            f"a calibration that shows at least {FEWEST_CORNERS_IN_VIEW} corners that no face hides",
+            f"a calibration that shows at least {FEWEST_CORNERS} corners that no face hides",
         )
     return None
 
