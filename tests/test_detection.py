@@ -52,27 +52,28 @@ def checked(sight: Sighting, settings: LensSettings, T: Array, target: Chequerbo
 
 
 CONDITIONS = {
-    "plain": (LENS, HELD, QUICK, 0.0, 54),
-    "fingers over a third of the plate": (LENS, HELD, QUICK, 0.36, 30),
-    "full of other corners": (LENS, HELD, Look(supersampling=2, clutter="mosaic"), 0.3, 36),
-    "three quarters of the light gone on one side": (LENS, HELD, Look(supersampling=2, falloff=0.75), 0.25, 40),
-    "blurred": (LENS, HELD, Look(supersampling=2, blur_px=2.2), 0.25, 40),
-    "noisy": (LENS, HELD, Look(supersampling=2, noise=8.0), 0.25, 40),
-    "light and dark exchanged": (LENS, HELD, Look(supersampling=2, inverted=True), 0.25, 40),
-    "small squares": (LENS, pose(BOARD, (0.0, 0.0, 1.4), (0.4, 0.2), 0.2), Look(supersampling=4), 0.0, 54),
-    "partly out of the image": (LENS, pose(BOARD, (0.05, 0.02, 0.2), (0.3, 0.3), 2.0), QUICK, 0.0, 20),
-    "a fisheye": (FISHEYE, pose(BOARD, (0.0, 0.0, 0.075), (0.3, -0.3), 1.0), QUICK, 0.2, 30),
+    "plain": (LENS, HELD, QUICK, 0.0, 54, 0.0043),
+    "fingers over a third of the plate": (LENS, HELD, QUICK, 0.36, 30, 0.0042),
+    "full of other corners": (LENS, HELD, Look(supersampling=2, clutter="mosaic"), 0.3, 36, 0.0045),
+    "three quarters of the light gone on one side": (LENS, HELD, Look(supersampling=2, falloff=0.75), 0.25, 40, 0.0136),
+    "blurred": (LENS, HELD, Look(supersampling=2, blur_px=2.2), 0.25, 40, 0.0216),
+    "noisy": (LENS, HELD, Look(supersampling=2, noise=8.0), 0.25, 40, 0.0218),
+    "light and dark exchanged": (LENS, HELD, Look(supersampling=2, inverted=True), 0.25, 40, 0.0039),
+    "small squares": (LENS, pose(BOARD, (0.0, 0.0, 1.4), (0.4, 0.2), 0.2), Look(supersampling=4), 0.0, 54, 0.0074),
+    "partly out of the image": (LENS, pose(BOARD, (0.05, 0.02, 0.2), (0.3, 0.3), 2.0), QUICK, 0.0, 20, 0.0041),
+    "a fisheye": (FISHEYE, pose(BOARD, (0.0, 0.0, 0.075), (0.3, -0.3), 1.0), QUICK, 0.2, 30, 0.0055),
 }
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_corners_are_found_where_they_are(condition: str):
-    settings, T, look, reach, least = CONDITIONS[condition]
+    """To twice what was measured (root mean square, px, of two seeds): three times as far off is no accident."""
+    settings, T, look, reach, least, rms_px = CONDITIONS[condition]
     image = render(settings, T, BOARD, look, covers=fingers(settings, reach) if reach else (), seed=2)
     sight = found_in(image)
     distance = checked(sight, settings, T)
     assert len(sight) >= least
-    assert np.sqrt(np.mean(distance**2) / 2.0) < 0.07 and distance.max() < 0.3
+    assert np.sqrt(np.mean(distance**2) / 2.0) < 2.0 * rms_px and distance.max() < 0.3
     assert sight.note == ("" if len(sight) == 54 else f"{len(sight)} of 54 points")
     assert len(set(sight.ids.tolist())) == len(sight)
 

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support.discs import blob_centres_px
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.lens_models import centre_offsets_px
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 from gripmon.model.records import Array
@@ -27,6 +27,7 @@ FISHEYE = FisheyeLens(
 PAPERS = CircleGrid(columns=8, rows=8, spacing_m=0.008, diameter_m=0.004)
 MARKED = Charuco(columns=8, rows=6, square_m=0.024, marker_m=0.017)
 HELD = pose(PAPERS, (0.001, -0.001, 0.145), (0.35, -0.25), 0.5)
+FAR = pose(PAPERS, (0.0, 0.0, 0.4), (0.4, 0.2), 0.2)
 HELD_MARKED = pose(MARKED, (0.0, 0.0, 0.33), (0.3, -0.25), 0.4)
 
 
@@ -39,7 +40,7 @@ def found_in(image: Array, target: Target) -> Sighting:
 def disc_errors(sight: Sighting, settings: LensSettings, T: Array) -> Array:
     """Distances (n,) to where the centre of each disc's *image* truly is; the lattice must be the plate's."""
     points = points_of(PAPERS)
-    uv = true_uv(settings, T, points) + centre_offsets_px(make_camera(settings), T, points, 0.002)
+    uv = blob_centres_px(make_camera(settings), T, points, 0.002)
     distance, index = cKDTree(np.where(np.isfinite(uv), uv, -1e6)).query(sight.uv_px)
     design = np.column_stack([sight.plate_m[:, :2], np.ones(len(sight))])
     change, *_ = np.linalg.lstsq(design, points[index, :2], rcond=None)
@@ -50,26 +51,27 @@ def disc_errors(sight: Sighting, settings: LensSettings, T: Array) -> Array:
 
 
 CONDITIONS = {
-    "plain": (LENS, HELD, Look(supersampling=3), 0.0, 64),
-    "fingers over a third of the plate": (LENS, HELD, Look(supersampling=3), 0.36, 34),
-    "full of other shapes": (LENS, HELD, Look(supersampling=3, clutter="mosaic"), 0.3, 40),
-    "light on dark": (LENS, HELD, Look(supersampling=3, inverted=True), 0.3, 40),
-    "three quarters of the light gone on one side": (LENS, HELD, Look(supersampling=3, falloff=0.75), 0.25, 40),
-    "blurred": (LENS, HELD, Look(supersampling=2, blur_px=2.0), 0.25, 40),
-    "noisy": (LENS, HELD, Look(supersampling=2, noise=8.0), 0.25, 40),
-    "small": (LENS, pose(PAPERS, (0.0, 0.0, 0.4), (0.4, 0.2), 0.2), Look(supersampling=3, clutter="plain"), 0.0, 64),
-    "a fisheye": (FISHEYE, pose(PAPERS, (0.0, 0.0, 0.035), (0.3, -0.3), 1.0), Look(supersampling=2), 0.2, 45),
+    "plain": (LENS, HELD, Look(supersampling=3), 0.0, 64, 0.0051),
+    "fingers over a third of the plate": (LENS, HELD, Look(supersampling=3), 0.36, 34, 0.006),
+    "full of other shapes": (LENS, HELD, Look(supersampling=3, clutter="mosaic"), 0.3, 40, 0.0059),
+    "light on dark": (LENS, HELD, Look(supersampling=3, inverted=True), 0.3, 40, 0.011),
+    "three quarters of the light gone on one side": (LENS, HELD, Look(supersampling=3, falloff=0.75), 0.25, 40, 0.008),
+    "blurred": (LENS, HELD, Look(supersampling=2, blur_px=2.0), 0.25, 40, 0.0156),
+    "noisy": (LENS, HELD, Look(supersampling=2, noise=8.0), 0.25, 40, 0.0263),
+    "small": (LENS, FAR, Look(supersampling=3, clutter="plain"), 0.0, 64, 0.0106),
+    "a fisheye": (FISHEYE, pose(PAPERS, (0.0, 0.0, 0.035), (0.3, -0.3), 1.0), Look(supersampling=2), 0.2, 45, 0.0059),
 }
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_discs_are_found_where_they_are(condition: str):
-    settings, T, look, reach, least = CONDITIONS[condition]
+    """To twice what was measured (root mean square, px, of two seeds)."""
+    settings, T, look, reach, least, rms_px = CONDITIONS[condition]
     image = render(settings, T, PAPERS, look, covers=fingers(settings, reach) if reach else (), seed=2)
     sight = found_in(image, PAPERS)
     errors = disc_errors(sight, settings, T)
     assert len(sight) >= least and sight.disc_radius_m == 0.002
-    assert np.sqrt(np.mean(errors**2) / 2.0) < 0.06 and errors.max() < 0.25
+    assert np.sqrt(np.mean(errors**2) / 2.0) < 2.0 * rms_px and errors.max() < 0.25
 
 
 def test_discs_that_a_finger_cuts_are_left_out():

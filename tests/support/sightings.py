@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.calibrate.lens_models import centre_offsets_px
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation
 from gripmon.model.records import Array
+from support.discs import blob_centres_px
 
 SIZE = {"width_px": 768, "height_px": 576}
 CAMERAS: dict[str, LensSettings] = {
@@ -61,7 +61,7 @@ def seen(
     for k, T in enumerate(cam_T_plate):
         uv = camera.project(true_m @ T[:3, :3].T + T[:3, 3])
         if radius_m:
-            uv = uv + centre_offsets_px(camera, T, true_m, radius_m)
+            uv = blob_centres_px(camera, T, true_m, radius_m)
         ok = np.isfinite(uv).all(axis=1) & (uv > 0).all(axis=1) & (uv < np.array(size) - 1).all(axis=1)
         if ok.sum() < 20:
             continue
