@@ -93,7 +93,7 @@ def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
     assert values["reachable"] and (values["alert_limit_m"], values["alert_limit_rad"]) == (1e-3, 0.035)
     assert set(found) == {"position_m", "rotation_rad", "risk", "hypothesis"} and found["risk"] == 1e-5
     (line,) = re.findall(r"^promise +(.*)$", text, re.MULTILINE)
-    assert line.startswith(f"a transform of this view is good to {1e3 * found['position_m']:.2g} mm and ")
+    assert line.startswith(f"forecast: a transform of this view is good to {1e3 * found['position_m']:.2g} mm and ")
     assert line.endswith(", alert limit 1 mm and 2°")
 
 
