@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.fresh_spots import AXES, calibration, drawn_setup, fresh, known, pixels, poses, true_setup
-from support.laser_scenes import numeric, scene
+from support.laser_scenes import numeric, paper_setup, sampled, scene
 
 from gripmon.calibrate.sighting import CalibrationError, NotFound
+from gripmon.daemon.config.yaml_file import read_document
+from gripmon.laser.api import Samples, check_laser
 from gripmon.laser.check import CheckSettings, Sample, SpotFault, check_spots
-from gripmon.laser.documents import calibrated
+from gripmon.laser.documents import LaserCalibration, calibrated, laser_document
 from gripmon.laser.explanations import covariance_max, foresee
 from gripmon.laser.forecast import forecast
-from gripmon.laser.setup import spots_on_plane
+from gripmon.laser.setup import in_camera, spots_on_plane
 from gripmon.laser.spots import Spot, plain_spot
 from gripmon.laser.ways import PAIRS, disagreements, three_ways
 from gripmon.model.geometry import perturb
@@ -353,3 +357,26 @@ def test_the_larger_of_two_covariances_is_nowhere_below_either():
 def test_files_whose_numbers_make_no_set_up_are_refused(change, said):
     with pytest.raises(CalibrationError, match=said):
         calibrated(change(calibration()))
+
+
+def test_a_file_of_an_earlier_version_says_what_it_said():
+    """Read, written again, and held against its truth, which it doesn't hold itself."""
+    path = Path(__file__).with_name("kept") / "laser_calibration.yaml"
+    earlier = read_document(path, LaserCalibration)
+    found = calibrated(earlier)
+    again = laser_document(
+        found.setup, found.covariance, earlier.camera, earlier.residuals, earlier.warnings, earlier.provenance
+    )
+    assert again.parameters == earlier.parameters
+    scale = np.sqrt(np.diag(np.reshape(earlier.covariance, (13, 13))))
+    off = np.reshape(np.subtract(again.covariance, earlier.covariance), (13, 13)) / np.outer(scale, scale)
+    assert np.abs(off).max() < 1e-9
+    assert np.allclose(again.plane.normal_cam, earlier.plane.normal_cam, atol=1e-12)
+    assert again.plane.distance_cam_m == pytest.approx(earlier.plane.distance_cam_m, abs=1e-12)
+    rng = np.random.default_rng(4)
+    truth = paper_setup(rng)
+    where = sampled(truth, rng, orientations=4).base_T_ee
+    for setup, cause in ((truth, None), (truth.moved(np.radians(3.0) * AXES[4]), Cause.CAMERA_MOUNT)):
+        seen = found.camera.project(in_camera(setup, spots_on_plane(setup, where)))
+        inside = (seen > 0.0).all(axis=1) & (seen < [639.0, 479.0]).all(axis=1)
+        assert check_laser(earlier, Samples.of_spots(seen[inside], where[inside])).cause is cause

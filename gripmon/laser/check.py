@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.documents import Calibrated
 from gripmon.laser.explanations import KINDS, SCALES, Evidence, Fit, Foreseen, foresee
+from gripmon.laser.refinement import PoseNoise
 from gripmon.laser.setup import CAMERA, spots_on_plane, spots_on_rays
 from gripmon.laser.spots import Spot
 from gripmon.laser.ways import SpotGap, disagreements, three_ways
@@ -39,30 +40,22 @@ _WHAT = {
 }
 
 
-class CheckSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The check's false-alarm rate, the noise of the arm, the rate of wrong spots."""
+@dataclass(frozen=True, slots=True)
+class CheckSettings:
+    """Accepted false alarms, per 1000 spots of an unmoved set-up; standard deviations of the arm's poses (m, rad; each
+    axis); share of spots that may be a reflection or no spot at all; probability from which a cause is named.
+    """
 
-    false_alarms_per_1000_pulses: Annotated[
-        float, Meta(gt=0.0, le=10.0, description="false alarms per 1000 spots of an unmoved set-up (1/1000)")
-    ] = 0.1
-    arm_noise_m: Annotated[
-        float, Meta(ge=0.0, le=0.1, description="standard deviation of the arm's reported positions, per axis (m)")
-    ] = 1e-4
-    arm_noise_rad: Annotated[
-        float, Meta(ge=0.0, le=0.5, description="standard deviation of the arm's reported rotations, per axis (rad)")
-    ] = 2e-4
-    wrong_spots: Annotated[
-        float, Meta(gt=0.0, le=0.5, description="expected fraction of spots that are a reflection or no spot at all")
-    ] = 0.2
-    probable: Annotated[
-        float,
-        Meta(gt=0.5, lt=1.0, description="probability from which a cause is named; below it the cause is unknown"),
-    ] = 0.9
+    false_alarms_per_1000_pulses: float = 0.1
+    arm_noise_m: float = 1e-4
+    arm_noise_rad: float = 2e-4
+    wrong_spots: float = 0.2
+    probable: float = 0.9
 
     @property
     def arm_covariance(self) -> Array:
         """Covariance (6, 6) of a pose that the arm reports, position then rotation."""
-        return np.diag(np.square([self.arm_noise_m] * 3 + [self.arm_noise_rad] * 3))
+        return PoseNoise(self.arm_noise_m, self.arm_noise_rad).covariance()
 
     def false_alarm_chance(self, spots: int) -> float:
         """The probability that this many spots show a motion though nothing has moved."""

@@ -6,22 +6,18 @@ import math
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.check import LEAST_SPOTS, CheckSettings
 from gripmon.laser.documents import Calibrated
 from gripmon.laser.explanations import KINDS, SCALES, assumed_motion, foresee
-from gripmon.laser.planning import poses_at
+from gripmon.laser.planning import SEED, candidates
 from gripmon.laser.setup import CAMERA, spots_on_plane, spots_on_rays
 from gripmon.model.records import Array
 
 SPOTS = (LEAST_SPOTS, 10, 30, 100)
-_BORDER = 0.2
-_GOLDEN = 0.6180339887498949
 _UNIT = np.array([0.01] * 6)
 """Metres and radians that are weighted alike: at half a metre, 10 mrad move a point by 5 mm."""
-Triple = tuple[float, ...]
 
 
 class SpotSigma(msgspec.Struct, frozen=True):
@@ -35,18 +31,8 @@ class Noticed(msgspec.Struct, frozen=True):
     """Motions of ``base_T_cam`` (base axes) that this many spots show on average."""
 
     pulses: int
-    position_m: Triple
-    rotation_rad: Triple
-
-
-class Assumed(msgspec.Struct, frozen=True):
-    """The poses of the forecast: ``tilt_rad`` of the beam against the plane's normal, each time in another direction;
-    ``distance_m`` from the laser to its spot.  Each spot is at another pose and place of the image.
-    """
-
-    spots: int = max(SPOTS)
-    tilt_rad: float = math.radians(30.0)
-    distance_m: float = 0.3
+    position_m: tuple[float, ...]
+    rotation_rad: tuple[float, ...]
 
 
 class Forecast(msgspec.Struct, frozen=True):
@@ -54,25 +40,22 @@ class Forecast(msgspec.Struct, frozen=True):
     the least, with its size for the most spots.
     """
 
-    assumed: Assumed
     spot_sigma: SpotSigma
     noticed: tuple[Noticed, ...]
     weakest: Noticed
 
 
 def forecast(known: Calibrated, settings: CheckSettings) -> Forecast:
-    """The forecast for assumed poses.  :class:`CalibrationError` if the camera sees no spot of them."""
-    assumed = Assumed()
-    poses = assumed_poses(known, assumed)
-    if len(poses) < assumed.spots:
+    """The forecast for spots at random poses.  :class:`CalibrationError` if the camera hardly sees a spot of them."""
+    poses = candidates(known.setup, known.camera, math.inf, np.random.default_rng(SEED))[: max(SPOTS)]
+    if len(poses) < max(SPOTS):
         raise CalibrationError("the camera hardly sees the plane; a file of a camera that looks at it")
     foreseen = foresee(known, poses, settings.arm_covariance)
     noise = foreseen.by_arm + known.sigma_px**2 * np.eye(2)
     values, axes = np.linalg.eigh(foreseen.by_calibration + noise)
     sigma_px = np.sqrt(values[:, -1])
-    ends = known.camera.undistort(foreseen.uv_px + axes[:, :, -1])
-    per_px = np.linalg.norm(spots_on_rays(known.setup, ends) - spots_on_plane(known.setup, poses), axis=1)
-    sigma_m = sigma_px * per_px
+    beside = spots_on_rays(known.setup, known.camera.undistort(foreseen.uv_px + axes[:, :, -1]))
+    sigma_m = sigma_px * np.linalg.norm(beside - spots_on_plane(known.setup, poses), axis=1)
     gains = [_Gain(known, foreseen.rows[:count], noise[:count], settings) for count in SPOTS]
     noticed = []
     for count, gain in zip(SPOTS, gains, strict=True):
@@ -81,35 +64,12 @@ def forecast(known: Calibrated, settings: CheckSettings) -> Forecast:
     _, directions = np.linalg.eigh(gains[-1].information * np.outer(_UNIT, _UNIT))
     weakest = directions[:, 0] * _UNIT
     weakest = weakest * gains[-1].size(weakest)
+    low_px, high_px, low_m, high_m = (float(end(each)) for each in (sigma_px, sigma_m) for end in (np.min, np.max))
     return Forecast(
-        assumed,
-        SpotSigma((float(sigma_px.min()), float(sigma_px.max())), (float(sigma_m.min()), float(sigma_m.max()))),
+        SpotSigma((low_px, high_px), (low_m, high_m)),
         tuple(noticed),
         Noticed(SPOTS[-1], tuple(weakest[:3].tolist()), tuple(weakest[3:].tolist())),
     )
-
-
-def assumed_poses(known: Calibrated, assumed: Assumed) -> Array:
-    """Poses ``base_T_ee`` (m, 4, 4), without those whose spots the camera wouldn't see; spread evenly over the image by
-    the Halton sequence of bases 2 and 3.
-    """
-    k = np.arange(1, assumed.spots + 1)
-    same = np.ones(len(k))
-    places = _BORDER + (1.0 - 2.0 * _BORDER) * np.stack([_halton(k, 2), _halton(k, 3)], axis=1)
-    uv_px = places * [known.camera.width_px, known.camera.height_px]
-    around = 2.0 * np.pi * _GOLDEN * k
-    tilt, far = assumed.tilt_rad * same, assumed.distance_m * same
-    return poses_at(known.setup, known.camera, uv_px, tilt, around, far, 0.0 * same)
-
-
-def _halton(index: NDArray[np.intp], base: int) -> Array:
-    """The radical inverses of whole numbers."""
-    out, part, rest = np.zeros(len(index)), 1.0, index.copy()
-    while rest.any():
-        part /= base
-        out += part * (rest % base)
-        rest //= base
-    return out
 
 
 class _Gain:

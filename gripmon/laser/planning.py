@@ -75,8 +75,14 @@ def candidates(setup: LaserSetup, camera: Camera, reach_m: float, rng: np.random
     tilt = STEEPEST_TILT_RAD * np.sqrt(rng.uniform(size=CANDIDATES))
     around, roll = rng.uniform(-np.pi, np.pi, (2, CANDIDATES))
     far = rng.uniform(NEAREST_M, max(2.0 * NEAREST_M, 0.8 * setup.distance_cam_m), CANDIDATES)
-    poses = poses_at(setup, camera, uv_px, tilt, around, far, roll)
-    places = poses[:, :3, 3]
+    upright = Rotation.align_vectors([setup.normal_base], [[0.0, 0.0, 1.0]])[0]
+    lean = Rotation.from_rotvec(tilt[:, None] * np.stack([np.cos(around), np.sin(around), 0.0 * around], axis=1))
+    to_axis = Rotation.align_vectors([[0.0, 0.0, 1.0]], [setup.direction_ee])[0]
+    base_R_ee = upright * lean * Rotation.from_rotvec(np.outer(roll, [0.0, 0.0, 1.0])) * to_axis
+    spots = spots_on_rays(setup, camera.undistort(uv_px))
+    places = spots - far[:, None] * base_R_ee.apply(setup.direction_ee) - base_R_ee.apply(setup.point_ee_m)
+    poses = np.tile(np.eye(4), (CANDIDATES, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = base_R_ee.as_matrix(), places
     reached = np.linalg.norm(places, axis=1)
     above = setup.distance_base_m - places @ setup.normal_base
     good = (reached <= reach_m) & (reached >= LEAST_REACH_M) & (above > 0.5 * NEAREST_M)
@@ -85,24 +91,3 @@ def candidates(setup: LaserSetup, camera: Camera, reach_m: float, rng: np.random
             f"within {reach_m:g} m of its base the arm has no pose whose spot the camera would see; a longer reach"
         )
     return poses[good]
-
-
-def poses_at(
-    setup: LaserSetup, camera: Camera, uv_px: Array, tilt_rad: Array, around_rad: Array, far_m: Array, roll_rad: Array
-) -> Array:
-    """``base_T_ee`` (m, 4, 4) whose spots are at the pixels (n, 2), without those whose rays miss the plane: the beam
-    tilted against the plane's normal, in a direction around it, the laser this far from its spot, the hand turned about
-    the beam; (n,) each.
-    """
-    zero = np.zeros(len(uv_px))
-    upright = Rotation.align_vectors([setup.normal_base], [[0.0, 0.0, 1.0]])[0]
-    lean = Rotation.from_rotvec(tilt_rad[:, None] * np.stack([np.cos(around_rad), np.sin(around_rad), zero], axis=1))
-    roll = Rotation.from_rotvec(roll_rad[:, None] * [0.0, 0.0, 1.0])
-    to_axis = Rotation.align_vectors([[0.0, 0.0, 1.0]], [setup.direction_ee])[0]
-    base_R_ee = upright * lean * roll * to_axis
-    spots = spots_on_rays(setup, camera.undistort(uv_px))
-    lasers = spots - far_m[:, None] * base_R_ee.apply(setup.direction_ee)
-    hands = lasers - base_R_ee.apply(setup.point_ee_m)
-    poses = np.tile(np.eye(4), (len(hands), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = base_R_ee.as_matrix(), hands
-    return poses[np.isfinite(hands).all(axis=1)]
