@@ -166,6 +166,17 @@ def test_what_moved_is_named_also_with_a_third_of_the_spots_wrong(change, cause)
     assert named >= 2
 
 
+def test_many_spots_tell_what_moved_no_worse_than_few():
+    """Evidences of a hundred spots differ by more powers of ten than numbers have."""
+    rng = np.random.default_rng(20)
+    where = some(rng, 100)
+    uv_px = fresh(true_setup().moved(0.05 * AXES[8]), where, rng)
+    inside = (uv_px > 0.0).all(axis=1) & (uv_px < [639.0, 479.0]).all(axis=1)
+    assert inside.sum() > 70
+    found = checked(uv_px[inside], where[inside])
+    assert found.cause is Cause.PLANE_MOVED and found.causes[0].probability > 0.999
+
+
 def test_no_motion_is_given_another_s_name():
     """Of random motions, from what hardly shows to centimetres: the cause is right, or unknown, or nothing is said."""
     parts = {Cause.CAMERA_MOUNT: slice(0, 6), Cause.PLANE_MOVED: slice(6, 9), Cause.LASER_MOVED: slice(9, 13)}

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from scipy.special import expit
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.documents import Calibrated
@@ -135,37 +136,40 @@ def check_spots(known: Calibrated, samples: Sequence[Sample], settings: CheckSet
     evidence = Evidence(known, np.stack([samples[k].base_T_ee for k in shown]), spots, arm, settings.wrong_spots)
     still = evidence.of(None)
     fits = [[evidence.of((kind, scale)) for scale in range(len(SCALES))] for kind in range(len(KINDS))]
-    ratios = np.array([[_ratio(fit, still) for fit in row] for row in fits])
-    weights = ratios * np.array([[share / len(SCALES)] for _, _, share in KINDS])
-    odds = float(weights.sum()) * settings.false_alarm_chance(len(shown))
+    shares = [share for _, _, share in KINDS]
+    weights = np.array([[_log_weight(fit, share) for fit in row] for row, share in zip(fits, shares, strict=True)])
+    total = float(np.logaddexp.reduce(weights, axis=None)) - still.evidence
+    probability = float(expit(total + math.log(settings.false_alarm_chance(len(shown)))))
+    moved = probability >= 0.5
     kind, scale = np.unravel_index(int(weights.argmax()), weights.shape)
-    best = fits[kind][scale] if odds >= 1.0 else still
+    best = fits[kind][scale] if moved else still
     for k, spot in zip(shown, _judged(known, evidence, best, [judged[k] for k in shown]), strict=True):
         judged[k] = spot
-    if odds < 1.0 or 2 * int(best.used.sum()) <= len(samples):
-        return _without_motion(judged, odds / (1.0 + odds))
-    shares = weights.sum(axis=1) / weights.sum()
-    order = [int(k) for k in np.argsort(-shares, kind="stable") if shares[k] > 1e-6]
-    causes = tuple(CauseWeight(KINDS[k][0], round(float(shares[k]), 6)) for k in order)
+    if not moved or 2 * int(best.used.sum()) <= len(samples):
+        return _without_motion(judged, probability)
+    probable = np.exp(weights - weights.max()).sum(axis=1)
+    probable /= probable.sum()
+    order = [int(k) for k in np.argsort(-probable, kind="stable") if probable[k] > 1e-6]
+    causes = tuple(CauseWeight(KINDS[k][0], round(float(probable[k]), 6)) for k in order)
     named = causes[0].probability >= settings.probable
     # What moved, and how far, without much of an assumption about its size.
     change, _ = evidence.motion(order[0], fits[order[0]][-1])
-    camera = _camera_motion(*evidence.motion(0, fits[0][-1])) if shares[0] > MAYBE else None
+    camera = _camera_motion(*evidence.motion(0, fits[0][-1])) if probable[0] > MAYBE else None
     text = _cause_text(known, evidence, causes[0].cause, change, camera) if named else _causes_text(causes)
     return LaserCheck(
         verdict="moved",
         text=_shift_text(known, evidence, best) + text,
         cause=causes[0].cause if named else Cause.UNKNOWN,
         causes=causes,
-        probability_moved=odds / (1.0 + odds),
+        probability_moved=probability,
         motion=camera,
         spots_judged=tuple(judged),
     )
 
 
-def _ratio(fit: Fit, still: Fit) -> float:
-    """The ratio of two evidences; none for a motion that hardly a spot shows."""
-    return math.exp(min(fit.evidence - still.evidence, 700.0)) if fit.used.sum() >= LEAST_SPOTS else 0.0
+def _log_weight(fit: Fit, share: float) -> float:
+    """The logarithm of a motion's evidence times its prior share; minus infinity if hardly a spot shows it."""
+    return fit.evidence + math.log(share / len(SCALES)) if fit.used.sum() >= LEAST_SPOTS else -math.inf
 
 
 def _without_motion(judged: Sequence[JudgedSpot], probability: float = 0.0) -> LaserCheck:

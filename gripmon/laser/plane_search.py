@@ -21,10 +21,10 @@ from gripmon.laser.setup import basis
 from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)
-SPACING_RAD = np.radians(7.5)
-"""Spacing of the normals that are tried: at twice that, one in thirty sets of three orientations with wrong spots was
-lost that it finds.
-"""
+SPACING_RAD = np.radians(15.0)
+"""Spacing of the normals that are tried first; it is halved around the best ones."""
+MOST_BEST = 4
+"""Number of best normals around which others are tried."""
 LEAST_DEPTH = 0.02
 """Minimum ``nᵀ ray`` for a spot in front of the camera."""
 SUBSET = 5
@@ -98,10 +98,13 @@ def find_plane(
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     orientations = [_Orientation(rays[m], w, rng) for m, w in zip(members, shifts_m, strict=True)]
     normals = _half_sphere()
-    costs = np.sum([o.trimmed(normals)[0] for o in orientations], axis=0)
-    normal = normals[int(costs.argmin())]
-    if not np.isfinite(costs).any():
-        raise CalibrationError("no plane before the camera carries the spots; spots and camera of one set-up")
+    for _ in range(2):
+        costs = np.sum([o.trimmed(normals)[0] for o in orientations], axis=0)
+        if not np.isfinite(costs).any():
+            raise CalibrationError("no plane before the camera carries the spots; spots and camera of one set-up")
+        best = normals[costs.argsort()[:MOST_BEST]]
+        normals = np.concatenate([best, _around(best, 0.5 * SPACING_RAD)])
+    normal = best[0]
     used = _believed(orientations, normal) if robust else [np.ones(len(o.rays), dtype=bool) for o in orientations]
     normal = _settled(orientations, used, normal)
     matrices = []
@@ -147,6 +150,14 @@ def _half_sphere() -> Array:
             np.stack([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.full(count, np.cos(tilt))], 1)
         )
     return np.array(out)
+
+
+def _around(normals: Array, angle_rad: float) -> Array:
+    """Six directions (6 m, 3) at an angle from each of (m, 3)."""
+    a, b = _across(normals)
+    turns = np.radians(60.0 * np.arange(6))[:, None, None]
+    out: Array = np.cos(angle_rad) * normals + np.sin(angle_rad) * (np.cos(turns) * a + np.sin(turns) * b)
+    return out.reshape(-1, 3)
 
 
 def _across(normals: Array) -> tuple[Array, Array]:
