@@ -9,15 +9,18 @@ from support.laser_scenes import assert_same, laser_printed, numeric, paper_setu
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser import closed_form
-from gripmon.laser.planar_start import planar_start
+from gripmon.laser.plane_search import find_plane
 from gripmon.laser.refinement import SpotProblem, refine
 from gripmon.laser.setup import (
     LaserSetup,
     basis,
-    laser_lines,
+    beams,
+    in_camera,
+    nearest_points,
     origin_axes,
-    pose_slopes,
+    spots_in_camera,
     spots_on_plane,
+    spots_on_rays,
 )
 from gripmon.model.geometry import invert, make_transform, perturb
 
@@ -26,48 +29,71 @@ def ideal(data):
     return data.camera.undistort(data.uv_px)
 
 
-# ---- the three predictions
+# ---- the three ways to a spot
 
 
-def test_the_three_predictions_meet_in_one_spot_that_lies_on_plane_line_and_ray():
+def test_the_three_ways_meet_in_one_spot_that_lies_on_plane_line_and_ray():
     data = scene()
-    spots, _ = spots_on_plane(data.truth, data.base_T_ee)
-    assert np.abs(spots @ data.truth.normal_cam - data.truth.distance_m).max() < 1e-12
-    origin, u = laser_lines(data.truth, data.base_T_ee)
-    assert np.abs(np.cross(spots - origin, u)).max() < 1e-12
-    xy = spots[:, :2] / spots[:, 2:]
-    assert np.abs(laser_printed.spots_on_rays(data.truth, xy)[0] - spots).max() < 1e-12
-    between, apart, _ = laser_printed.spots_between(data.truth, data.base_T_ee, xy)
-    assert np.abs(between - spots).max() < 1e-12
-    assert apart.max() < 1e-12
+    spots = spots_on_plane(data.truth, data.base_T_ee)
+    assert np.abs(spots @ data.truth.normal_base - data.truth.distance_base_m).max() < 1e-12
+    points, u = beams(data.truth, data.base_T_ee)
+    assert np.abs(np.cross(spots - points, u)).max() < 1e-12
+    assert np.abs(data.camera.project(in_camera(data.truth, spots)) - data.uv_px).max() < 1e-9
+    assert np.abs(spots_on_rays(data.truth, ideal(data)) - spots).max() < 1e-11
+    for between in nearest_points(data.truth, data.base_T_ee, ideal(data)):
+        assert np.abs(between - spots).max() < 1e-11
 
 
-def test_a_moved_plane_and_a_moved_camera_show_in_different_residuals():
+def test_a_moved_plane_and_a_moved_camera_show_in_different_gaps():
     data = scene()
     xy = ideal(data)
-    lower = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, data.truth.distance_m + 0.01,
-                       data.truth.point_ee_m, data.truth.direction_ee)  # fmt: skip
-    assert laser_printed.spots_between(lower, data.base_T_ee, xy)[1].max() < 1e-12  # no plane in it
-    moved = data.truth.moved(np.array([0.0, 0.005, 0.0, 0.0, 0.0, 0.0] + [0.0] * 7))
-    assert np.median(laser_printed.spots_between(moved, data.base_T_ee, xy)[1]) > 5e-4
+
+    def apart(setup):
+        on_rays, on_beams = nearest_points(setup, data.base_T_ee, xy)
+        return np.linalg.norm(on_rays - on_beams, axis=1)
+
+    assert apart(data.truth.moved(0.01 * np.eye(13)[8])).max() < 1e-11  # no plane in it
+    assert np.median(apart(data.truth.moved(0.005 * np.eye(13)[1]))) > 5e-4
 
 
+def test_the_nearest_points_are_those_of_a_search():
+    data = scene()
+    xy = ideal(data)[:5] + 0.01
+    points, u = beams(data.truth, data.base_T_ee[:5])
+    rays = np.concatenate([xy, np.ones((5, 1))], axis=1) @ data.truth.base_T_cam[:3, :3].T
+    on_rays, on_beams = nearest_points(data.truth, data.base_T_ee[:5], xy)
+    for k in range(5):
+        design = np.stack([rays[k], -u[k]], axis=1)
+        depth, along = np.linalg.lstsq(design, points[k] - data.truth.base_T_cam[:3, 3], rcond=None)[0]
+        assert np.abs(on_rays[k] - data.truth.base_T_cam[:3, 3] - depth * rays[k]).max() < 1e-12
+        assert np.abs(on_beams[k] - points[k] - along * u[k]).max() < 1e-12
+
+
+@pytest.mark.parametrize("far", [0.0, 0.5])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_jacobians_of_the_predictions_are_those_of_central_differences(seed):
+def test_the_jacobian_of_spots_is_that_of_central_differences(seed, far):
     data = scene(seed)
-    setup, poses = data.truth, data.base_T_ee
-    slopes = spots_on_plane(setup, poses)[1]
-    assert np.abs(slopes - numeric(lambda d: spots_on_plane(setup.moved(d), poses)[0], 13)).max() < 1e-7
-    by_pose = numeric(lambda d: spots_on_plane(setup, np.stack([perturb(T, d) for T in poses]))[0], 6)
-    assert np.abs(pose_slopes(setup, poses) - by_pose).max() < 1e-7
-    # Off the truth, so that line and ray don't meet.
-    xy = ideal(data) + np.random.default_rng(seed).normal(0.0, 3e-3, data.uv_px.shape)
-    on_rays = numeric(lambda d: laser_printed.spots_on_rays(setup, xy + d)[0], 2)
-    assert np.abs(laser_printed.spots_on_rays(setup, xy)[1] - on_rays).max() < 1e-7
-    depths = numeric(lambda d: laser_printed.spots_between(setup, poses, xy + d)[0][:, 2], 2)
-    assert np.abs(laser_printed.spots_between(setup, poses, xy)[2] - depths).max() < 1e-7 * max(
-        1.0, float(np.abs(depths).max())
-    )
+    setup, poses = data.truth.moved(far * np.random.default_rng(seed).normal(size=13)), data.base_T_ee
+
+    def seen(change):
+        moved = np.stack([perturb(T, change[13:]) for T in poses])
+        return spots_in_camera(setup.moved(change[:13]), moved)[0]
+
+    slopes = spots_in_camera(setup, poses)[1]
+    there = np.linalg.norm(spots_in_camera(setup, poses)[0], axis=1) < 5.0
+    assert there.any()
+    assert np.abs(slopes - numeric(seen, 19))[there].max() < 1e-5
+
+
+def test_a_setup_as_the_camera_has_it_is_the_same_in_the_base():
+    data = scene()
+    again = LaserSetup.seen(
+        data.truth.cam_T_base, data.truth.normal_cam, data.truth.distance_cam_m, data.truth.point_ee_m,
+        data.truth.direction_ee,
+    )  # fmt: skip
+    assert_same(again, data.truth, 1e-12)
+    spots = in_camera(data.truth, spots_on_plane(data.truth, data.base_T_ee))
+    assert np.abs(spots @ data.truth.normal_cam - data.truth.distance_cam_m).max() < 1e-12
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.1, 0.2, 0.97)])
@@ -90,7 +116,8 @@ def true_orientations(data):
         centre = data.base_T_ee[members, :3, 3].mean(axis=0)
         base_R_ee = data.base_T_ee[members[0], :3, :3]
         pose = make_transform(base_R_ee, centre)[None]
-        spot, u = spots_on_plane(setup, pose)[0][0], laser_lines(setup, pose)[1][0]
+        spot = in_camera(setup, spots_on_plane(setup, pose))[0]
+        u = setup.cam_T_base[:3, :3] @ beams(setup, pose)[1][0]
         motion = (np.eye(3) - np.outer(u, setup.normal_cam) / (u @ setup.normal_cam)) @ setup.cam_T_base[:3, :3]
         scales.append(rng.uniform(0.3, 3.0))
         matrix = np.concatenate([motion, spot[:, None]], axis=1) / scales[-1]
@@ -156,7 +183,7 @@ def test_steps_7_and_8_positions_scales_and_the_plane_distance():
     assert np.abs(shift - data.truth.cam_T_base[:3, 3]).max() < 1e-9
     assert np.abs(found - scales).max() < 1e-9
     distance = laser_printed.plane_distance(orientations, scales, data.truth.normal_cam, data.base_T_ee)
-    assert abs(distance - data.truth.distance_m) < 1e-9
+    assert abs(distance - data.truth.distance_cam_m) < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -172,7 +199,7 @@ def test_beams_along_other_axes_choose_another_origin_plane():
         paper = paper_setup(rng)
         u = np.array(direction)
         point = np.array([0.02, -0.03, 0.05]) * (1.0 - u)
-        truth = LaserSetup(paper.cam_T_base, paper.normal_cam, paper.distance_m, point, u)
+        truth = LaserSetup(paper.base_T_cam, paper.normal_base, paper.distance_base_m, point, u)
         data = sampled(truth, rng)
         for method in (laser_printed.solve, closed_form.solve):
             assert_same(method(ideal(data), data.base_T_ee), truth)
@@ -185,11 +212,11 @@ def test_the_common_planes_start_is_exact():
     data = scene(2)
     orientations, _ = true_orientations(data)
     shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
-    normal, matrices = planar_start(ideal(data), shifts, [o.members for o in orientations])
+    normal, matrices = find_plane(ideal(data), shifts, [o.members for o in orientations])
     assert np.abs(normal - data.truth.normal_cam).max() < 1e-9
-    cam_R_base, beams_cam, distance_m = closed_form.turn_from_motions([m[:, :3] for m in matrices], normal)
+    cam_R_base, beams_cam, distance_m = closed_form.rotation_and_beams([m[:, :3] for m in matrices], normal)
     assert np.abs(cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    assert abs(distance_m - data.truth.distance_m) < 1e-9
+    assert abs(distance_m - data.truth.distance_cam_m) < 1e-9
     for beam, orientation in zip(beams_cam, orientations, strict=True):
         u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
         assert np.abs(np.cross(beam, u)).max() < 1e-9
@@ -237,7 +264,7 @@ def refused(data, poses=None, uv=None):
 
 def replayed(data, poses):
     """The same set-up with other poses."""
-    uv = data.camera.project(spots_on_plane(data.truth, poses)[0])
+    uv = data.camera.project(in_camera(data.truth, spots_on_plane(data.truth, poses)))
     return poses, uv
 
 
@@ -290,7 +317,7 @@ def test_a_beam_that_meets_the_plane_at_the_same_angle_everywhere_is_named():
     normal = np.array([0.0, 0.1, 0.99]) / np.linalg.norm([0.0, 0.1, 0.99])
     motion = np.eye(3) - np.outer(normal, normal)
     with pytest.raises(CalibrationError, match="same angle at every orientation"):
-        closed_form.turn_from_motions([motion, motion, motion], normal)
+        closed_form.rotation_and_beams([motion, motion, motion], normal)
 
 
 def test_poses_the_wrong_way_round_are_refused_or_fit_nothing():

@@ -15,7 +15,7 @@ from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
-from gripmon.laser.setup import NAMES
+from gripmon.laser.documents import NAMES
 from gripmon.model.geometry import inverse_jacobian, invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
 from gripmon.model.yaml_text import as_yaml
@@ -61,10 +61,10 @@ def assert_near(written, truth, tolerance_m=0.01):
     """Within five standard deviations of the truth, and these small."""
     found = np.array(written["base_T_cam"]["translation_m"])
     sigmas = np.array([written["sigmas"][f"base_T_cam.{axis}_m"] for axis in "xyz"])
-    error = found - invert(truth.cam_T_base)[:3, 3]
+    error = found - truth.base_T_cam[:3, 3]
     assert (np.abs(error) < 5.0 * sigmas).all()
     assert sigmas.max() < tolerance_m
-    assert abs(written["plane"]["distance_cam_m"] - truth.distance_m) < 5.0 * written["sigmas"]["plane.distance_m"]
+    assert abs(written["plane"]["distance_cam_m"] - truth.distance_cam_m) < 5.0 * written["sigmas"]["plane.distance_m"]
     assert np.abs(np.array(written["laser"]["direction_ee"]) - truth.direction_ee).max() < 0.01
 
 

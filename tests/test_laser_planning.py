@@ -12,7 +12,7 @@ from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # n
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.planning import candidates, plan
 from gripmon.laser.refinement import SpotProblem, refine
-from gripmon.laser.setup import spots_on_plane
+from gripmon.laser.setup import in_camera, spots_on_plane
 from gripmon.model.geometry import perturbation_between
 
 
@@ -23,6 +23,10 @@ def calibrated(seed, orientations=4):
     return data, uv, refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
 
 
+def project(data, base_T_ee):
+    return data.camera.project(in_camera(data.truth, spots_on_plane(data.truth, base_T_ee)))
+
+
 def test_planned_poses_are_within_reach_and_their_spots_in_view():
     data, _, refined = calibrated(1)
     planned = plan(refined, 0.8, 12)
@@ -31,7 +35,7 @@ def test_planned_poses_are_within_reach_and_their_spots_in_view():
     rotations = planned.base_T_ee[:, :3, :3]
     assert np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
     # At the true set-up, too, which the plan doesn't know.
-    uv = data.camera.project(spots_on_plane(data.truth, planned.base_T_ee)[0])
+    uv = project(data, planned.base_T_ee)
     assert np.abs(uv - planned.uv_px).max() < 10.0
     assert (uv > 0.0).all() and (uv < [639.0, 479.0]).all()
 
@@ -41,12 +45,10 @@ def test_what_is_foretold_is_what_a_calibration_with_these_poses_says():
     planned = plan(refined, 1.0, 10)
     assert (np.diff(planned.sigmas[:, 0] ** 2 + (0.55 * planned.sigmas[:, 1]) ** 2) < 0.0).all()
     poses = np.concatenate([data.base_T_ee, planned.base_T_ee])
-    exact = data.camera.project(spots_on_plane(data.truth, poses)[0])
+    exact = project(data, poses)
     rng = np.random.default_rng(3)
     again = refine(SpotProblem(data.camera, poses, exact + rng.normal(0.0, refined.scale, exact.shape)), data.truth)
-    from gripmon.laser.calibrating import base_covariance
-
-    sigma = np.sqrt(np.trace(base_covariance(again)[:3, :3]))
+    sigma = np.sqrt(np.trace(again.covariance[:3, :3]))
     assert sigma == pytest.approx(planned.sigmas[-1, 0], rel=0.35)
 
 
@@ -55,16 +57,16 @@ def test_planned_poses_help_more_than_random_ones():
     for seed in range(15):
         data, uv, refined = calibrated(seed)
         rng = np.random.default_rng(seed + 100)
-        drawn = candidates(refined.setup, refined, 1.0, rng)
+        drawn = candidates(refined.setup, data.camera, 1.0, rng)
         for name, more in (
             ("planned", plan(refined, 1.0, 8).base_T_ee),
             ("random", drawn[rng.permutation(len(drawn))[:8]]),
         ):
-            spots = data.camera.project(spots_on_plane(data.truth, more)[0])
+            spots = project(data, more)
             seen = np.concatenate([uv, spots + rng.normal(0.0, 0.5, spots.shape)])
             poses = np.concatenate([data.base_T_ee, more])
             found = refine(SpotProblem(data.camera, poses, seen), refined.setup)
-            errors[name].append(perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)[:3])
+            errors[name].append(perturbation_between(found.setup.base_T_cam, data.truth.base_T_cam)[:3])
     planned, drawn = (np.sqrt(np.mean(np.square(errors[name]))) for name in ("planned", "random"))
     assert planned < 0.8 * drawn
 

@@ -13,10 +13,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser import closed_form, refinement
 from gripmon.laser.calibrating import Spots, calibrate, contradictions
 from gripmon.laser.refinement import FALSE_OUTLIERS, PoseNoise, SpotProblem, refine, with_held_lens
-from gripmon.laser.setup import (
-    PARAMETERS,
-    LaserSetup,
-)
+from gripmon.laser.setup import PARAMETERS, LaserSetup
 from gripmon.model.geometry import perturb, perturbation_between
 
 
@@ -59,7 +56,7 @@ def test_errors_are_what_the_covariance_says():
     for seed in range(trials):
         data, uv = noisy(seed, orientations=9)
         found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        error = perturbation_between(found.setup.base_T_cam, data.truth.base_T_cam)
         size = error @ np.linalg.solve(found.covariance[:6, :6], error)
         normalised.append(size / 6.0)
         inside += size < 6.0 * fisher_f.ppf(0.95, 6, found.degrees_of_freedom)
@@ -81,8 +78,8 @@ def test_an_arms_noise_that_is_modelled_makes_errors_smaller():
         pixel = np.tile(0.01 * np.eye(2), (len(uv), 1, 1))
         without = refine(SpotProblem(data.camera, poses, uv, pixel), data.truth)
         found = refine(SpotProblem(data.camera, poses, uv, pixel, pose_noise=noise), data.truth)
-        plain.append(perturbation_between(without.setup.cam_T_base, data.truth.cam_T_base))
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        plain.append(perturbation_between(without.setup.base_T_cam, data.truth.base_T_cam))
+        error = perturbation_between(found.setup.base_T_cam, data.truth.base_T_cam)
         modelled.append(error)
         sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
         assert 0.7 < found.scale < 1.3  # spots and arm together explain the residuals
@@ -102,7 +99,7 @@ def test_spots_noise_that_nobody_told_is_what_the_arms_leaves():
         poses = np.stack([perturb(T, root * rng.normal(size=6)) for T in data.base_T_ee])
         labels = tuple(map(str, data.group))
         found = calibrate(data.camera, poses, Spots(uv), labels, pose_noise=noise).refined
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        error = perturbation_between(found.setup.base_T_cam, data.truth.base_T_cam)
         sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
         assert 0.7 < found.scale < 1.3
     assert 0.6 < np.mean(sizes) < 1.7
@@ -127,7 +124,7 @@ def test_a_slightly_wrong_lens_needs_its_part_in_the_covariance():
             (held, with_held_lens(exact, problem, lens)),
             (freed, refine(problem, start)),
         ):
-            error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+            error = perturbation_between(found.setup.base_T_cam, data.truth.base_T_cam)
             out.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
         assert found.lens_covariance.shape == (4, 4) and found.covariance.shape == (13, 13)
         assert (found.lens_covariance.diagonal() <= prior.diagonal() * 1.001).all()
@@ -156,7 +153,7 @@ def test_a_held_lens_moves_the_solution_as_a_solution_with_another_lens_says(fre
     kept = solved(np.zeros(len(free))).used
     found = solved(np.zeros(len(free)))
     sigmas = np.array([1.0, 1.0, 1.0, 1.0, 1e-3])[list(free)] * 0.1
-    ends = [[solved(s * sigmas * e).setup.cam_T_base for s in (-1.0, 1.0)] for e in np.eye(len(free))]
+    ends = [[solved(s * sigmas * e).setup.base_T_cam for s in (-1.0, 1.0)] for e in np.eye(len(free))]
     by_lens = np.stack([perturbation_between(*pair) / 2.0 for pair in ends], axis=1)
     lens = prior_of(model, believed, free, np.diag(sigmas**2))
     problem = SpotProblem(model.camera(believed), data.base_T_ee[kept], uv[kept], lens=lens)
@@ -171,8 +168,8 @@ def test_what_is_not_determined_is_refused():
     one = data.group == 0
     with pytest.raises(CalibrationError, match=r"don't tell all|agree with each other"):
         refine(SpotProblem(data.camera, data.base_T_ee[one], data.uv_px[one]), data.truth)
-    behind = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, -1.0, data.truth.point_ee_m,
-                        data.truth.direction_ee)  # fmt: skip
+    behind = LaserSetup.seen(data.truth.cam_T_base, data.truth.normal_cam, -1.0, data.truth.point_ee_m,
+                             data.truth.direction_ee)  # fmt: skip
     with pytest.raises(CalibrationError, match="before the camera"):
         refine(SpotProblem(data.camera, data.base_T_ee, data.uv_px), behind)
 

@@ -22,8 +22,8 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.calibrate.documents import RobotWorldCalibration
+    from gripmon.laser.documents import LaserCalibration
     from gripmon.laser.planning import Plan
-    from gripmon.laser.setup import LaserCalibration
 
 LONGEST_ARM_M = 20.0
 _LASER_OPTIONS = """

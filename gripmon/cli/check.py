@@ -12,8 +12,8 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
-    from gripmon.laser.judgement import SpotWatchSettings
-    from gripmon.laser.setup import LaserCalibration
+    from gripmon.laser.check import CheckSettings
+    from gripmon.laser.documents import LaserCalibration
 
 _OPTIONS = """
 [CONFIG...]  configuration file (YAML); with --laser: tables of fresh spots
@@ -26,8 +26,7 @@ _OPTIONS = """
 
 _LASER = """\
 Instead of a configuration: does a file of gripmon calibrate laser still hold?  SPOTS are fresh tables of \
-spots and poses as for gripmon calibrate laser, in the order in which they were taken.  Without SPOTS: which \
-motions fresh spots would detect."""
+spots and poses as for gripmon calibrate laser.  Without SPOTS: which motions fresh spots would detect."""
 
 _LASER_OPTIONS = """
 --laser LASER.yaml  the calibration; the other arguments are SPOTS, if any
@@ -128,19 +127,31 @@ def _lines(values: dict[str, Any], *, verbose: bool) -> list[str]:
 
 
 def _check_laser(arguments: Arguments) -> int:
-    from gripmon.laser.api import check_laser as judge
-    from gripmon.laser.report import check_values, expectation
+    import msgspec
 
-    settings, path = _watch_settings(arguments), arguments.laser
+    from gripmon.laser.api import check_laser, forecast_laser
+
+    settings, path = _check_settings(arguments), arguments.laser
     if not path.is_file():
         raise InputError(f"--laser {path}: there is no such file; a file of gripmon calibrate laser")
     calibration = _read_laser(path)
+    residuals = calibration.residuals
+    header = {
+        "calibration": str(path),
+        "time": calibration.provenance.time,
+        "spots": residuals.spots,
+        "used": residuals.used,
+        "rms_px": residuals.rms_px,
+        "arm_noise_m": settings.arm_noise_m,
+        "arm_noise_rad": settings.arm_noise_rad,
+        "false_alarms_per_1000_pulses": settings.false_alarms_per_1000_pulses,
+    }
     if not arguments.config:
-        report = expectation(str(path), calibration, settings)
+        report = {**header, **msgspec.to_builtins(forecast_laser(calibration, settings))}
         arguments.answer(report, render.lines(report))
         return EXIT_DONE
-    found = judge(calibration, [Path(name) for name in arguments.config], settings, progress_bar)
-    report = check_values(str(path), calibration, settings, found)
+    found = check_laser(calibration, [Path(name) for name in arguments.config], settings, progress_bar)
+    report = {**header, **msgspec.to_builtins(found)}
     shown = {**report, "spots_judged": [_spot_row(each) for each in report["spots_judged"]]}
     shown["verdict"] = f"{shown.pop('verdict')}: {shown.pop('text')}"  # last
     arguments.answer(report, render.lines(shown))
@@ -160,19 +171,18 @@ def _read_laser(path: Path) -> LaserCalibration:
     from gripmon.calibrate.sighting import CalibrationError
     from gripmon.daemon.config.typed import ConfigError
     from gripmon.daemon.config.yaml_file import read_document
-    from gripmon.laser.setup import LaserCalibration
-    from gripmon.laser.watch import SpotWatch
+    from gripmon.laser.documents import LaserCalibration, calibrated
 
     calibration = read_document(path, LaserCalibration)
     try:
-        SpotWatch(calibration)  # whether its numbers make a set-up
+        calibrated(calibration)  # whether its numbers make a set-up
     except (CalibrationError, ValueError) as error:
         raise ConfigError(path, "", str(error)) from None
     return calibration
 
 
-def _watch_settings(arguments: Arguments) -> SpotWatchSettings:
-    from gripmon.laser.judgement import SpotWatchSettings
+def _check_settings(arguments: Arguments) -> CheckSettings:
+    from gripmon.laser.check import CheckSettings
 
     given: dict[str, Any] = {}
     if arguments.arm_noise is not None:
@@ -183,4 +193,4 @@ def _watch_settings(arguments: Arguments) -> SpotWatchSettings:
             raise InputError(f"--{name.replace('_', '-')} {value:g}: too many; at most {most:g}")
         if value is not None:
             given["false_alarms_per_1000_pulses" if name == "false_alarms" else name] = value
-    return SpotWatchSettings(**given)
+    return CheckSettings(**given)

@@ -1,4 +1,4 @@
-"""A fixed camera and a laser pointer on the arm: calibration, a monitor of that calibration, and its laser pulses.
+"""A fixed camera, a plane and a laser pointer on the arm: their calibration, and whether it still holds.
 
 The functions for programs are in :mod:`gripmon.laser.api`.
 """

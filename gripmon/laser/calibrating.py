@@ -13,12 +13,10 @@ from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.robot_world import OFFSETS
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
+from gripmon.laser.documents import LEAST_NOISE_PX
 from gripmon.laser.refinement import PoseNoise, Refined, SpotProblem, refine, with_held_lens
-from gripmon.laser.setup import NAMES, LaserCalibration, LaserLine, LaserResiduals, LaserSetup, Plane
-from gripmon.laser.world import LEAST_NOISE_PX
+from gripmon.laser.setup import LASER, LaserSetup
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import inverse_jacobian, invert, to_record, to_vector
-from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 
 FARTHEST_PLANE_M = 50.0
@@ -37,7 +35,12 @@ contradicts the others.
 """
 MOST_CONTRADICTING = 1.0 / 3.0
 """Largest share of orientations that may contradict the rest: above it there is no telling which are right."""
+SUSPECT_PX = 3.0
+"""Noise of the spots (px) above which other readings of the poses are tried."""
+LEAST_FITTING = 0.7
+"""Minimum inlier ratio of another reading before it is reported."""
 _NOISE_ROUNDS = 8
+_CANDIDATE_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,24 +65,6 @@ class LaserResult:
     warnings: tuple[str, ...] = ()
 
 
-def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
-    """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` if samples with one label
-    have different orientations.
-    """
-    if labels is None:
-        return orientation_groups(base_T_ee)
-    out = []
-    for label in dict.fromkeys(labels):
-        members = np.flatnonzero(np.array([other == label for other in labels]))
-        if len(orientation_groups(base_T_ee[members], MOST_TURN_RAD)) > 1:
-            raise CalibrationError(
-                f"the end-effector turns within group {label}; groups of shifts without turning, or no groups: they "
-                "are found from the poses"
-            )
-        out.append(members)
-    return out
-
-
 def calibrate(
     camera: Camera,
     base_T_ee: Array,
@@ -99,24 +84,112 @@ def calibrate(
         u, v = spots.uv_px[index]
         raise CalibrationError(f"spot {index + 1} at ({u:.1f}, {v:.1f}) px is outside of what the lens maps")
     groups = groups_of(labels, base_T_ee)
+    refiner = _Refiner(camera, base_T_ee, spots.covariance_px, lens if refine_lens else None, pose_noise)
     fault: CalibrationError | None = None
     try:
-        start = solve(xy, base_T_ee, groups)
-        found = _refined(camera, base_T_ee, spots, start, lens if refine_lens else None, pose_noise)
+        found = _with_candidates(refiner, spots, solve(xy, base_T_ee, groups))
     except CalibrationError as error:
         fault = error
-    sound = fault is None and found.refined.used.mean() >= LEAST_AGREEING
-    if not sound or found.refined.scale_px >= SUSPECT_PX:
+    if fault is not None or found.refined.used.mean() < LEAST_AGREEING or found.refined.scale_px >= SUSPECT_PX:
         check_reading(camera, base_T_ee, spots.uv_px, fault)
     if fault is not None:
         raise fault
-    _check_sizes(found.refined)
     _check_agreement(found.refined, camera.width_px)
+    _check_sizes(found.refined)
     refined = found.refined
     if lens is not None and not refine_lens:
         problem = SpotProblem(camera, base_T_ee, found.uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise)
         refined = with_held_lens(refined, problem, lens)
     return replace(found, refined=refined, warnings=contradictions(refined.used, groups))
+
+
+def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
+    """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` if samples with one label
+    have different orientations.
+    """
+    if labels is None:
+        return orientation_groups(base_T_ee)
+    out = []
+    for label in dict.fromkeys(labels):
+        members = np.flatnonzero(np.array([other == label for other in labels]))
+        if len(orientation_groups(base_T_ee[members], MOST_TURN_RAD)) > 1:
+            raise CalibrationError(
+                f"the end-effector turns within group {label}; groups of shifts without turning, or no groups: they "
+                "are found from the poses"
+            )
+        out.append(members)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Refiner:
+    """Everything that a refinement needs beside the spots themselves and a start."""
+
+    camera: Camera
+    base_T_ee: Array
+    covariance_px: Array | None
+    lens: GivenCamera | None
+    pose_noise: PoseNoise | None
+
+    def refine(self, uv_px: Array, start: LaserSetup) -> Refined:
+        if self.pose_noise is None or self.covariance_px is not None:
+            return refine(self._problem(uv_px, self.covariance_px, self.pose_noise), start)
+        # The arm's noise is given in metres: the rest of the residuals is the spots' own noise.
+        found = refine(self._problem(uv_px, None, None), start)
+        sigma_px = found.scale
+        for _ in range(_NOISE_ROUNDS):
+            noise = np.tile(sigma_px**2 * np.eye(2), (len(uv_px), 1, 1))
+            found = refine(self._problem(uv_px, noise, self.pose_noise), found.setup)
+            if abs(found.scale - 1.0) < 0.03 or sigma_px <= LEAST_NOISE_PX:
+                break
+            sigma_px = max(sigma_px * min(found.scale, 1.0) ** 2, LEAST_NOISE_PX)
+        return found
+
+    def _problem(self, uv_px: Array, covariance_px: Array | None, pose_noise: PoseNoise | None) -> SpotProblem:
+        return SpotProblem(self.camera, self.base_T_ee, uv_px, covariance_px, lens=self.lens, pose_noise=pose_noise)
+
+
+def _with_candidates(refiner: _Refiner, spots: Spots, start: LaserSetup) -> LaserResult:
+    """Refine; where a reflection is brighter than the spot, with the candidate nearest to the prediction."""
+    uv_px, choice = spots.uv_px, np.zeros(len(spots.uv_px), dtype=np.intp)
+    found = refiner.refine(uv_px, start)
+    for _ in range(_CANDIDATE_ROUNDS if spots.others else 0):
+        predicted = uv_px - found.residuals_px
+        new, new_choice = spots.uv_px.copy(), np.zeros_like(choice)
+        for k in np.flatnonzero(~found.used):
+            candidates = np.concatenate([spots.uv_px[k][None], spots.others[k].reshape(-1, 2)])
+            nearest = int(np.linalg.norm(candidates - predicted[k], axis=1).argmin())
+            new[k], new_choice[k] = candidates[nearest], nearest
+        kept = found.used & (choice > 0)
+        new[kept], new_choice[kept] = uv_px[kept], choice[kept]
+        if (new_choice == choice).all():
+            break
+        uv_px, choice = new, new_choice
+        found = refiner.refine(uv_px, found.setup)
+    return LaserResult(start, found, uv_px, choice)
+
+
+def _check_sizes(found: Refined) -> None:
+    """Reject implausible sizes.  Positions in another unit fit as well: they scale the distances of camera, plane and
+    laser, and the image doesn't change.  Only implausible sizes reveal it.
+    """
+    setup = found.setup
+    if setup.distance_cam_m > FARTHEST_PLANE_M:
+        raise CalibrationError(
+            f"the plane would be {setup.distance_cam_m:.4g} m from the camera: are the poses in millimetres? metres"
+        )
+    if setup.distance_cam_m < NEAREST_PLANE_M:
+        raise CalibrationError(
+            f"the plane would be {1e3 * setup.distance_cam_m:.4g} mm from the camera: were metres divided once too "
+            "often? metres"
+        )
+    offset = float(np.linalg.norm(np.cross(setup.point_ee_m, setup.direction_ee)))
+    sigma = float(np.sqrt(found.covariance.diagonal()[LASER][2:].max()))
+    if offset - 3.0 * sigma > FARTHEST_LASER_M:
+        raise CalibrationError(
+            f"the laser's line would pass the end-effector's origin at {offset:.3g} m: are the poses in centimetres or "
+            "inches, or of another frame than the hand's? metres, base_T_ee"
+        )
 
 
 def _check_agreement(refined: Refined, width_px: int) -> None:
@@ -136,190 +209,61 @@ def contradictions(used: NDArray[np.bool_], groups: Sequence[NDArray[np.intp]]) 
     """A line for each orientation most of whose spots aren't ``used`` (n,); ``groups`` holds each orientation's
     members.  Raises :class:`CalibrationError` if too few orientations agree to tell which are right.
     """
+
+    def where(members: NDArray[np.intp]) -> str:
+        wrong = len(members) - int(used[members].sum())
+        return f"{wrong} of its {len(members)} spots left out, spots {members.min() + 1} to {members.max() + 1}"
+
     counted = [members for members in groups if len(members) >= FEWEST_SHIFTS]
     against = [members for members in counted if used[members].mean() < LEAST_OF_ORIENTATION]
     left = len(counted) - len(against)
     if against and (left < FEWEST_ORIENTATIONS or len(against) > MOST_CONTRADICTING * len(counted)):
         raise CalibrationError(
-            f"{len(against)} of {len(counted)} orientations contradict the others ({_where(against[0], used)}): the "
+            f"{len(against)} of {len(counted)} orientations contradict the others ({where(against[0])}): the "
             "hand turned or the plane moved between them, spots beside the plane, or another camera's file; "
             f"at least {FEWEST_ORIENTATIONS} orientations that agree, and twice as many as don't"
         )
     return tuple(
-        f"an orientation contradicts the others: {_where(members, used)}; this calibration holds if it is that one "
+        f"an orientation contradicts the others: {where(members)}; this calibration holds if it is that one "
         "which is wrong (spots beside the plane, a pose that was misread)"
         for members in against
     )
-
-
-def _where(members: NDArray[np.intp], used: NDArray[np.bool_]) -> str:
-    wrong = len(members) - int(used[members].sum())
-    return f"{wrong} of its {len(members)} spots left out, spots {members.min() + 1} to {members.max() + 1}"
-
-
-def _refined(
-    camera: Camera,
-    base_T_ee: Array,
-    spots: Spots,
-    start: LaserSetup,
-    lens: GivenCamera | None,
-    pose_noise: PoseNoise | None,
-) -> LaserResult:
-    def solved(uv_px: Array, setup: LaserSetup) -> Refined:
-        noise = spots.covariance_px
-        problem = SpotProblem(camera, base_T_ee, uv_px, noise, lens=lens, pose_noise=pose_noise)
-        if pose_noise is None or noise is not None:
-            return refine(problem, setup)
-        return _separated(problem, uv_px, refine(SpotProblem(camera, base_T_ee, uv_px, lens=lens), setup))
-
-    def _separated(problem: SpotProblem, uv_px: Array, found: Refined) -> Refined:
-        # The arm's noise is given in metres: the rest of the residuals is the spots' own noise.
-        sigma_px = found.scale
-        for _ in range(_NOISE_ROUNDS):
-            noise = np.tile(sigma_px**2 * np.eye(2), (len(uv_px), 1, 1))
-            problem = SpotProblem(camera, base_T_ee, uv_px, noise, lens=lens, pose_noise=pose_noise)
-            found = refine(problem, found.setup)
-            if abs(found.scale - 1.0) < 0.03 or sigma_px <= LEAST_NOISE_PX:
-                break
-            sigma_px = max(sigma_px * min(found.scale, 1.0) ** 2, LEAST_NOISE_PX)
-        return found
-
-    uv_px, choice = spots.uv_px, np.zeros(len(spots.uv_px), dtype=np.intp)
-    found = solved(uv_px, start)
-    for _ in range(3 if spots.others else 0):
-        # A reflection may be brighter than the spot: then use the candidate nearest to the prediction.
-        predicted = uv_px - found.residuals_px
-        new, new_choice = spots.uv_px.copy(), np.zeros_like(choice)
-        for k in np.flatnonzero(~found.used):
-            candidates = np.concatenate([spots.uv_px[k][None], spots.others[k].reshape(-1, 2)])
-            nearest = int(np.linalg.norm(candidates - predicted[k], axis=1).argmin())
-            new[k], new_choice[k] = candidates[nearest], nearest
-        kept = found.used & (choice > 0)
-        new[kept], new_choice[kept] = uv_px[kept], choice[kept]
-        if (new_choice == choice).all():
-            break
-        uv_px, choice = new, new_choice
-        found = solved(uv_px, found.setup)
-    return LaserResult(start, found, uv_px, choice)
-
-
-def _check_sizes(found: Refined) -> None:
-    """Reject implausible sizes.  Positions in another unit fit as well: they scale the distances of camera, plane and
-    laser, and the image doesn't change.  Only implausible sizes reveal it.
-    """
-    setup = found.setup
-    if setup.distance_m > FARTHEST_PLANE_M:
-        raise CalibrationError(
-            f"the plane would be {setup.distance_m:.4g} m from the camera: are the poses in millimetres? metres"
-        )
-    if setup.distance_m < NEAREST_PLANE_M:
-        raise CalibrationError(
-            f"the plane would be {1e3 * setup.distance_m:.4g} mm from the camera: were metres divided once too often? "
-            "metres"
-        )
-    across = setup.point_ee_m - setup.direction_ee * float(setup.point_ee_m @ setup.direction_ee)
-    offset, sigma = float(np.linalg.norm(across)), float(np.sqrt(found.covariance.diagonal()[11:13].max()))
-    if offset - 3.0 * sigma > FARTHEST_LASER_M:
-        raise CalibrationError(
-            f"the laser's line would pass the end-effector's origin at {offset:.3g} m: are the poses in centimetres or "
-            "inches, or of another frame than the hand's? metres, base_T_ee"
-        )
-
-
-SUSPECT_PX = 3.0
-"""Noise of the spots (px) above which other readings of the poses are tried."""
-LEAST_FITTING = 0.7
-"""Minimum inlier ratio of another reading before it is reported."""
 
 
 def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: CalibrationError | None) -> None:
     """Raise :class:`CalibrationError` if the spots (n, 2) fit another reading of the poses (n, 4, 4); ``fault`` is the
     failure under the given reading.
     """
-    xy = camera.undistort(uv_px)
-    for poses, part, said in _readings(base_T_ee):
+    for poses, part, wrong, right in _readings(base_T_ee):
         try:
-            found = refine(SpotProblem(camera, poses, uv_px[part]), solve(xy[part], poses))
+            start = solve(camera.undistort(uv_px[part]), poses)
+            found = refine(SpotProblem(camera, poses, uv_px[part]), start)
         except CalibrationError:
             continue
         if found.used.mean() > LEAST_FITTING and found.scale < SUSPECT_PX:
             agree = f"{int(found.used.sum())} of {len(poses)} agree, {found.scale:.2g} px"
-            raise CalibrationError(said.format(agree=agree)) from fault
+            raise CalibrationError(f"{wrong} ({agree}); {right}") from fault
 
 
-def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
-    """Other readings: poses, the spots that belong to them, and a message to be completed with how well they fit."""
+def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str, str]]:
+    """Other readings: poses, the spots that belong to them, what is wrong if the spots fit, and what would be right."""
     everything = slice(None)
-    inverted = np.stack([invert(pose) for pose in base_T_ee])
-    yield inverted, everything, "the poses are ee_T_base: inverted, the spots fit ({agree}); base_T_ee"
-    quaternions = Rotation.from_matrix(base_T_ee[:, :3, :3]).as_quat()
-    reordered = base_T_ee.copy()
-    reordered[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
-    yield (
-        reordered,
-        everything,
-        ("the quaternions have w first: read so, the spots fit ({agree}); qx, qy, qz, qw, in this order"),
-    )
-    transposed = base_T_ee.copy()
-    transposed[:, :3, :3] = base_T_ee[:, :3, :3].transpose(0, 2, 1)
-    yield (
-        transposed,
-        everything,
-        ("the rotations are the other way round: inverted, the spots fit ({agree}); base_R_ee"),
-    )
+    turns = base_T_ee[:, :3, :3]
+
+    def turned(rotations: Array) -> Array:
+        out = base_T_ee.copy()
+        out[:, :3, :3] = rotations
+        return out
+
+    yield np.linalg.inv(base_T_ee), everything, "the poses are ee_T_base: inverted, the spots fit", "base_T_ee"
+    w_first = Rotation.from_quat(np.roll(Rotation.from_matrix(turns).as_quat(), -1, axis=1)).as_matrix()
+    text = "the quaternions have w first: read so, the spots fit"
+    yield turned(w_first), everything, text, "qx, qy, qz, qw, in this order"
+    text = "the rotations are the other way round: inverted, the spots fit"
+    yield turned(turns.transpose(0, 2, 1)), everything, text, "base_R_ee"
     for offset in OFFSETS:
         count = len(base_T_ee) - abs(offset)
-        own = slice(max(offset, 0), max(offset, 0) + count)
-        other = slice(max(-offset, 0), max(-offset, 0) + count)
+        poses, spots = (slice(first, first + count) for first in (max(offset, 0), max(-offset, 0)))
         which = "later" if offset > 0 else "earlier"
-        yield (
-            base_T_ee[own],
-            other,
-            (
-                f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which} ({{agree}}); each "
-                "spot with its own pose"
-            ),
-        )
-
-
-def base_covariance(refined: Refined) -> Array:
-    """Covariance (13, 13) of :data:`NAMES`."""
-    change = np.eye(len(NAMES))
-    change[:6, :6] = inverse_jacobian(refined.setup.cam_T_base)
-    out: Array = change @ refined.covariance @ change.T
-    return out
-
-
-def document(
-    refined: Refined, names: tuple[str, ...], orientations: int, warnings: tuple[str, ...], provenance: Provenance
-) -> LaserCalibration:
-    """The contents of a result's file."""
-    setup, covariance = refined.setup, base_covariance(refined)
-    base_T_cam = invert(setup.cam_T_base)
-    normal_base = base_T_cam[:3, :3] @ setup.normal_cam
-    sigmas = np.sqrt(covariance.diagonal())
-    return LaserCalibration(
-        camera=refined.camera,
-        base_T_cam=to_record(base_T_cam),
-        plane=Plane(
-            normal_cam=to_vector(setup.normal_cam),
-            distance_cam_m=setup.distance_m,
-            normal_base=to_vector(normal_base),
-            distance_base_m=setup.distance_m + float(normal_base @ base_T_cam[:3, 3]),
-        ),
-        laser=LaserLine(point_ee_m=to_vector(setup.point_ee_m), direction_ee=to_vector(setup.direction_ee)),
-        parameters=NAMES,
-        sigmas=dict(zip(NAMES, sigmas.tolist(), strict=True)),
-        covariance=tuple(covariance.ravel().tolist()),
-        residuals=LaserResiduals(
-            rms_px=refined.rms_px,
-            sigma_px=refined.scale_px,
-            spots=len(names),
-            used=int(refined.used.sum()),
-            orientations=orientations,
-            degrees_of_freedom=refined.degrees_of_freedom,
-            outliers=tuple(name for name, used in zip(names, refined.used, strict=True) if not used),
-        ),
-        warnings=warnings,
-        provenance=provenance,
-    )
+        text = f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which}"
+        yield base_T_ee[poses], spots, text, "each spot with its own pose"

@@ -1,19 +1,18 @@
-"""Camera pose, laser line and plane from laser spots in closed form: one plane for all orientations, and so a single
-scale and no ambiguous sign.
+"""The closed form in the paper's eight steps: camera pose, plane and laser line from laser spots, without a start.
 
 At each of M orientations the end-effector is shifted without rotation; the spot then moves on the plane by
 
-    p = T_m + G_m C_R_B w,    G_m = I - u_m nᵀ / (u_mᵀ n)
+    p = T_m + G_m C_R_B w,    G_m = I - u_m nᵀ / (u_mᵀ n)                                            (15), (20), (21)
 
-(w the shift in base axes, u_m the beam, n the plane's normal, camera axes).
-:mod:`~gripmon.laser.planar_start` gives n and, from spots ``s = ray / (nᵀ ray)`` with the same scale 1 / distance
-everywhere, one matrix per orientation whose part in the plane is
+(w the shift in base axes, u_m the beam, n the plane's normal, camera axes).  The paper takes each orientation by
+itself, with an unknown scale and an unknown sign each.  Here all share one plane: with n known, spots are
+``s = ray / (nᵀ ray)``, of the same scale 1 / distance everywhere, and an orientation's part in the plane is
 
     A_m = P G_m R / distance = (P R - (P v_m) (nᵀ R)) / distance,    R = C_R_B,  u_m ~ n + v_m,
 
 P being the two axes of the plane.  Differences between orientations therefore have rank one, with the row nᵀ R, the
-plane's normal in base axes; the component of all A_m orthogonal to it is P R / distance.  Steps 4 and 5 of the paper
-thus become linear, over all orientations at once; there they have an unknown scale and an unknown sign each.
+plane's normal in base axes; the component of all A_m orthogonal to it is P R / distance.  Steps 4 and 5 thus become
+linear, over all orientations at once.  ``tools/benchmarks/laser_printed.py`` has the steps as printed.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.robot_world import LEAST_TURN_RAD
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.planar_start import SUBSET, planar_start
+from gripmon.laser.plane_search import SUBSET, find_plane
 from gripmon.laser.setup import LaserSetup, basis, origin_axes
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
@@ -41,6 +40,29 @@ ON_A_LINE = 3e-3
 FLAT = 1e-3
 """Ratio of third to first singular value below which shifts count as coplanar."""
 SAME_ORIENTATION_RAD = 4e-3
+
+
+def solve(
+    xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, robust: bool = True
+) -> LaserSetup:
+    """The set-up from ideal image points ``xy`` (n, 2), which step 1 has undistorted, and poses (n, 4, 4); ``robust``:
+    leave wrong spots out.  :class:`CalibrationError` if the data don't determine it.
+    """
+    check_spots(xy)
+    usable = usable_orientations(base_T_ee, groups, SUBSET + 1)
+    shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
+    normal, matrices = find_plane(xy, shifts, [o.members for o in usable], robust=robust)  # steps 2, 3
+    usable = [replace(o, matrix=m) for o, m in zip(usable, matrices, strict=True)]
+    cam_R_base, beams_cam, _ = rotation_and_beams([o.matrix[:, :3] for o in usable], normal)  # steps 4, 5
+    direction = beam_in_hand(beams_cam, [o.base_R_ee for o in usable], cam_R_base)  # step 6
+    point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction, one_plane=True)  # step 7
+    distance = float(scales[0])  # step 8, equation (34): nᵀ s = 1 for all spots, and their scale is the distance
+    if distance <= 0.0:
+        raise CalibrationError(
+            "the spots put the plane behind the camera: poses and spots don't belong together (out of step, or "
+            "ee_T_base for base_T_ee); each spot with the pose that it was seen at"
+        )
+    return LaserSetup.seen(make_transform(cam_R_base, shift), normal, distance, point, direction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +124,6 @@ def usable_orientations(
         shifts = base_T_ee[members, :3, 3]
         spread = np.linalg.svd(shifts - shifts.mean(axis=0), compute_uv=False)
         if spread[2] >= FLAT * spread[0] and spread[0] > 0.0:
-            # Step 5, equations (26) to (29): SciPy's mean is the eigenvector that the paper seeks.
             rotation = Rotation.from_matrix(base_T_ee[members, :3, :3]).mean().as_matrix()
             usable.append(Orientation(members, rotation, shifts.mean(axis=0), np.empty((3, 4))))
     if len(usable) < FEWEST_ORIENTATIONS:
@@ -127,7 +148,34 @@ def _check_turns(base_R_ee: Array) -> None:
         )
 
 
-def beam_in_hand(beams_cam: Sequence[Array], base_R_ee: Sequence[Array], cam_R_base: Array) -> Array:
+def rotation_and_beams(motions: Sequence[Array], normal: Array) -> tuple[Array, Array, float]:
+    """Steps 4 and 5, equations (19) to (29), from the matrices (3, 3) by which shifts in base axes move the spots of
+    the plane ``normalᵀ s = 1`` (camera axes): ``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, oriented
+    along the normal whichever way the laser points), and the plane's distance (m).
+    """
+    plane = np.stack(basis(normal))
+    flat = np.stack([plane @ m for m in motions])  # A_m
+    mean = flat.mean(axis=0)
+    _, sizes, rows = np.linalg.svd((flat - mean).reshape(-1, 3), full_matrices=False)
+    if sizes[0] < FLAT * np.linalg.norm(flat):
+        raise CalibrationError(
+            "the beam meets the plane at the same angle at every orientation; orientations that tilt the beam"
+        )
+    normal_base = rows[0]  # up to its sign
+    # P R / distance has two orthogonal rows of equal length: take the nearest such matrix.
+    left, sizes, right = np.linalg.svd(mean @ (np.eye(3) - np.outer(normal_base, normal_base)), full_matrices=False)
+    if sizes[1] < FLAT * sizes[0]:
+        raise CalibrationError("the spots move along one line only; a beam that doesn't run along the plane")
+    turned = left @ right
+    scale = float(sizes.mean())
+    normal_base = np.cross(turned[0], turned[1])
+    cam_R_base: Array = np.concatenate([plane, normal[None]]).T @ np.concatenate([turned, normal_base[None]])
+    leaning = -(flat @ normal_base) / scale  # P v_m
+    beams_cam = normal + leaning @ plane
+    return cam_R_base, beams_cam / np.linalg.norm(beams_cam, axis=1)[:, None], 1.0 / scale
+
+
+def beam_in_hand(beams_cam: Sequence[Array] | Array, base_R_ee: Sequence[Array], cam_R_base: Array) -> Array:
     """Step 6, equations (30), (31): the beam's direction (3,) in the end-effector, least squares over orientations."""
     total = np.sum([(cam_R_base @ R).T @ u for u, R in zip(beams_cam, base_R_ee, strict=True)], axis=0)
     out: Array = total / np.linalg.norm(total)
@@ -154,7 +202,8 @@ def positions(
     axes = list(origin_axes(direction_ee))
     count = 1 if one_plane else len(orientations)
     rows, sides = [], []
-    for m, (orientation, shifts_m) in enumerate(zip(orientations, _shifts_of(orientations, base_T_ee), strict=True)):
+    for m, orientation in enumerate(orientations):
+        shifts_m = base_T_ee[orientation.members, :3, 3] - orientation.centre_m
         turned = cam_R_base @ orientation.base_R_ee
         across = np.cross(np.eye(3), turned @ direction_ee)  # u x ..., up to a sign that both sides share
         spots = np.concatenate([shifts_m, np.ones((len(shifts_m), 1))], axis=1) @ orientation.matrix.T
@@ -175,61 +224,4 @@ def positions(
     solution = np.linalg.lstsq(matrix / sizes, np.concatenate(sides), rcond=None)[0] / sizes
     point = np.zeros(3)
     point[axes] = solution[:2]
-    scales: Array = np.broadcast_to(solution[5:], (len(orientations),)) if one_plane else solution[5:]
-    return point, solution[2:5], scales
-
-
-def _shifts_of(orientations: Sequence[Orientation], base_T_ee: Array) -> list[Array]:
-    return [base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
-
-
-def solve(
-    xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, robust: bool = True
-) -> LaserSetup:
-    """The closed-form set-up from ideal image points ``xy`` (n, 2) and poses (n, 4, 4); ``robust``: detect wrong spots
-    and leave them out.  :class:`CalibrationError` if the data don't determine it.
-    """
-    check_spots(xy)
-    usable = usable_orientations(base_T_ee, groups, SUBSET + 1)
-    shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
-    normal, matrices = planar_start(xy, shifts, [o.members for o in usable], robust=robust)
-    usable = [replace(o, matrix=m) for o, m in zip(usable, matrices, strict=True)]
-    cam_R_base, beams, _ = turn_from_motions([o.matrix[:, :3] for o in usable], normal)
-    direction = beam_in_hand(list(beams), [o.base_R_ee for o in usable], cam_R_base)
-    point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction, one_plane=True)
-    distance = float(scales[0])
-    if distance <= 0.0:
-        raise CalibrationError(
-            "the spots put the plane behind the camera: poses and spots don't belong together (out of step, or "
-            "ee_T_base for base_T_ee); each spot with the pose that it was seen at"
-        )
-    return LaserSetup(make_transform(cam_R_base, shift), normal, distance, point, direction)
-
-
-def turn_from_motions(motions: Sequence[Array], normal: Array) -> tuple[Array, Array, float]:
-    """Steps 4 and 5 together, from the matrices (3, 3) by which shifts in base axes move the spots of the plane
-    ``normalᵀ s = 1`` (camera axes): ``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, oriented along the
-    normal whichever way the laser points), and the plane's distance (m).
-    """
-    plane = np.stack(basis(normal))
-    flat = np.stack([plane @ m for m in motions])
-    apart = flat - flat.mean(axis=0)
-    left, sizes, rows = np.linalg.svd(apart.reshape(-1, 3), full_matrices=False)
-    if sizes[0] < FLAT * np.linalg.norm(flat):
-        raise CalibrationError(
-            "the beam meets the plane at the same angle at every orientation; orientations that tilt the beam"
-        )
-    across = rows[0]
-    mean = flat.mean(axis=0) @ (np.eye(3) - np.outer(across, across))
-    # P R / distance has two orthogonal rows of equal length: take the nearest such matrix.
-    left, sizes, right = np.linalg.svd(mean, full_matrices=False)
-    if sizes[1] < FLAT * sizes[0]:
-        raise CalibrationError("the spots move along one line only; a beam that doesn't run along the plane")
-    turned = left @ right
-    scale = float(sizes.mean())
-    third = np.cross(turned[0], turned[1])
-    cam_R_base: Array = np.concatenate([plane, normal[None]]).T @ np.concatenate([turned, third[None]])
-    # A_m third = -(P v_m) / distance
-    leaning = -(flat @ third) / scale
-    beams = normal + leaning @ plane
-    return cam_R_base, beams / np.linalg.norm(beams, axis=1)[:, None], 1.0 / scale
+    return point, solution[2:5], solution[5:]

@@ -16,7 +16,7 @@ from scipy.special import chdtri, fdtri
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
+from gripmon.laser.setup import COUNT, LaserSetup, in_camera, spots_in_camera, spots_on_plane
 from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.least_squares import (
     TUKEY,
@@ -40,6 +40,7 @@ _ITERATIONS_A_ROUND = 6
 _ROUNDS = 40
 _SELECTIONS = 10
 _LEAST_TESTED = 1e-6
+_LEAST = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,109 +73,48 @@ class Refined:
         return self.rms_px * float(np.sqrt(2 * int(self.used.sum()) / freedom))
 
 
-@dataclass(frozen=True, slots=True)
-class _Tukey:
-    """Cost and weights of whitened residuals; ``scale`` is one coordinate's standard deviation, by which priors are
-    weighted against the spots.
-    """
-
-    scale: float
-
-    def cost(self, sizes: Array) -> float:
-        return tukey_cost(sizes, TUKEY * self.scale)
-
-    def weights(self, sizes: Array) -> Array:
-        return tukey_weights(sizes, TUKEY * self.scale)
-
-
-@dataclass(frozen=True, slots=True)
-class _Squares:
-    """Like :class:`_Tukey`, but with weight one for the ``used`` spots (n,) and zero for the others."""
-
-    scale: float
-    used: NDArray[np.bool_]
-
-    def cost(self, sizes: Array) -> float:
-        return float(np.square(sizes[self.used]).sum())
-
-    def weights(self, _sizes: Array) -> Array:
-        return self.used.astype(float)
-
-
 def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
     """The best set-up near a start.  Raises :class:`CalibrationError` if it is not determined."""
     state = problem.start(start)
-    scale = _scale(problem, state)
+    scale = _robust_scale(problem, state)
     for _ in range(_ROUNDS):
-        state = _minimise(problem, state, _Tukey(scale), _ITERATIONS_A_ROUND)
-        newest = _scale(problem, state)
+        state = _minimise(problem, state, _Loss(scale), _ITERATIONS_A_ROUND)
+        newest = _robust_scale(problem, state)
         if newest > 0.999 * scale:
             break
         scale = newest
     problem = problem.with_pose_noise(state)
-    scale = _scale(problem, state)
-    state = _minimise(problem, state, _Tukey(scale), _ITERATIONS)
-    scale = _scale(problem, state)
-    used = problem.sizes(state) <= float(np.sqrt(chdtri(2, FALSE_OUTLIERS / len(problem)))) * scale
-    for _ in range(_SELECTIONS):
-        _check_enough(problem, used)
-        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
-        scale = _scale_of(problem, state, used)
-        again = _consistent(problem, state, used, scale)
-        if (again == used).all():
+    state = _minimise(problem, state, _Loss(_robust_scale(problem, state)), _ITERATIONS)
+    limit = float(np.sqrt(chdtri(2, FALSE_OUTLIERS / len(problem))))
+    used = problem.sizes(state) <= limit * _robust_scale(problem, state)
+    for _ in range(_SELECTIONS):  # of two alternating sets the last fit's is kept
+        fitted = used
+        state = _least_squares(problem, state, fitted)
+        used = _consistent(problem, state, fitted)
+        if (used == fitted).all():
             break
-        used = again
-    else:  # two alternating sets: keep the last fit's
-        _check_enough(problem, used)
-        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
-    return _conclude(problem, state, used)
+    return _conclude(problem, state, fitted)
 
 
-_LEAST = 1e-9
-
-
-def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], scale: float) -> NDArray[np.bool_]:
-    """Spots (n,) that are consistent with the fit to all others.
-
-    A used spot pulls the fit towards itself, one that is left out doesn't: by its leverage G its residual r has the
-    covariance s² (I - G) or s² (I + G).  With the scale of the others, rᵀ (I ∓ G)⁻¹ r / 2 s² has an F distribution
-    (Cook and Weisberg, 1982), and is the same whether or not the spot is in the fit.  A single threshold and scale for
-    all would leave out twice as many good spots as it states, and make the rest look better than it is.
+@dataclass(frozen=True, slots=True)
+class _Loss:
+    """Cost and weights of whitened residuals: Tukey's biweight, or, with ``used`` (n,), squares of these alone;
+    ``scale`` is one coordinate's standard deviation, by which priors are weighted against the spots.
     """
-    rows, values = problem.linearised(state)
-    normal, _ = _equations(problem, state, _Squares(scale, used))
-    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-    leverage = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
-    pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
-    spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
-    # A spot that alone determines a parameter fits however wrong it is, so it can't be tested.
-    tested = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TESTED
-    spread[~tested] = np.eye(2)
-    sizes = np.where(tested, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
-    whole = 2 * int(used.sum()) - len(PARAMETERS)
-    freedom = np.maximum(whole - 2.0 * used, 1.0)
-    variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom
-    ratio = 0.5 * sizes / np.maximum(variance, _LEAST**2)
-    limit = fdtri(2, freedom, 1.0 - FALSE_OUTLIERS / len(problem))
-    out: NDArray[np.bool_] = np.isfinite(problem.sizes(state)) & ((ratio <= limit) | (whole <= 2))
-    return out
+
+    scale: float
+    used: NDArray[np.bool_] | None = None
+
+    def cost(self, sizes: Array) -> float:
+        if self.used is None:
+            return tukey_cost(sizes, TUKEY * self.scale)
+        return float(np.square(sizes[self.used]).sum())
+
+    def weights(self, sizes: Array) -> Array:
+        return tukey_weights(sizes, TUKEY * self.scale) if self.used is None else self.used.astype(float)
 
 
-def _scale_of(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> float:
-    """Standard deviation of one coordinate, from the used spots' residuals."""
-    freedom = 2 * int(used.sum()) - len(PARAMETERS)
-    return max(float(np.sqrt(np.square(problem.sizes(state)[used]).sum() / freedom)), _LEAST)
-
-
-def _check_enough(problem: SpotProblem, used: NDArray[np.bool_]) -> None:
-    if 2 * int(used.sum()) <= problem.unknowns:
-        raise CalibrationError(
-            f"{int(used.sum())} of {len(problem)} spots agree with each other; at least {problem.unknowns // 2 + 1}, "
-            "better 50"
-        )
-
-
-def _minimise(problem: SpotProblem, state: State, loss: _Tukey | _Squares, iterations: int) -> State:
+def _minimise(problem: SpotProblem, state: State, loss: _Loss, iterations: int) -> State:
     def cost(at: State) -> float:
         return loss.cost(problem.sizes(at)) + loss.scale**2 * float(np.square(problem.prior(at)[1]).sum())
 
@@ -184,7 +124,7 @@ def _minimise(problem: SpotProblem, state: State, loss: _Tukey | _Squares, itera
     return minimise(state, cost, equations, State.moved, iterations=iterations).state
 
 
-def _equations(problem: SpotProblem, state: State, loss: _Tukey | _Squares) -> Equations:
+def _equations(problem: SpotProblem, state: State, loss: _Loss) -> Equations:
     """Normal equations of the spots and of the prior, in the spots' unit."""
     rows, values = problem.linearised(state)
     spots = normal_equations(rows, values, loss.weights(np.linalg.norm(values, axis=1)))
@@ -192,30 +132,71 @@ def _equations(problem: SpotProblem, state: State, loss: _Tukey | _Squares) -> E
     return spots[0] + loss.scale**2 * prior[0], spots[1] + loss.scale**2 * prior[1]
 
 
-def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Refined:
-    freedom = 2 * int(used.sum()) - len(PARAMETERS)
+def _least_squares(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> State:
+    if 2 * int(used.sum()) <= problem.unknowns:
+        raise CalibrationError(
+            f"{int(used.sum())} of {len(problem)} spots agree with each other; at least {problem.unknowns // 2 + 1}, "
+            "better 50"
+        )
+    return _minimise(problem, state, _Loss(_scale_of(problem, state, used), used), _ITERATIONS)
+
+
+def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Spots (n,) that are consistent with the fit to all others.
+
+    A used spot pulls the fit towards itself, one that is left out doesn't: by its leverage G its residual r has the
+    covariance s² (I - G) or s² (I + G).  With the scale of the others, rᵀ (I ∓ G)⁻¹ r / 2 s² has an F distribution
+    (Cook and Weisberg, 1982), and is the same whether or not the spot is in the fit.  A single threshold and scale for
+    all would leave out twice as many good spots as it states, and make the rest look better than it is.
+    """
     scale = _scale_of(problem, state, used)
-    normal, _ = _equations(problem, state, _Squares(scale, used))
+    rows, values = problem.linearised(state)
+    normal, _ = _equations(problem, state, _Loss(scale, used))
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    leverage = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+    pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
+    spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
+    # A spot that alone determines a parameter fits however wrong it is, so it can't be tested.
+    tested = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TESTED
+    spread[~tested] = np.eye(2)
+    sizes = np.where(tested, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
+    whole = 2 * int(used.sum()) - COUNT
+    freedom = np.maximum(whole - 2.0 * used, 1.0)
+    variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom
+    ratio = 0.5 * sizes / np.maximum(variance, _LEAST**2)
+    limit = fdtri(2, freedom, 1.0 - FALSE_OUTLIERS / len(problem))
+    out: NDArray[np.bool_] = np.isfinite(problem.sizes(state)) & ((ratio <= limit) | (whole <= 2))
+    return out
+
+
+def _robust_scale(problem: SpotProblem, state: State) -> float:
+    """Robust standard deviation of one coordinate, corrected for the number of parameters."""
+    scale = robust_scale(problem.sizes(state), 2)
+    if not np.isfinite(scale):
+        raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
+    left = max(1.0 - COUNT / (2.0 * len(problem)), 0.25)
+    return max(scale / float(np.sqrt(left)), _LEAST)
+
+
+def _scale_of(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> float:
+    """Standard deviation of one coordinate, from the used spots' residuals."""
+    freedom = 2 * int(used.sum()) - COUNT
+    return max(float(np.sqrt(np.square(problem.sizes(state)[used]).sum() / freedom)), _LEAST)
+
+
+def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Refined:
+    scale = _scale_of(problem, state, used)
+    normal, _ = _equations(problem, state, _Loss(scale, used))
     try:
         covariance = covariance_of(normal, scale**2)
     except np.linalg.LinAlgError:
         raise CalibrationError(
             "the spots don't tell all of camera, plane and laser; more orientations, turned about two axes or more"
         ) from None
-    k = len(PARAMETERS)
     return Refined(
-        state.setup, covariance[:k, :k], problem.residuals_px(state), used, scale, freedom,
-        problem.camera(state).settings, state.lens, covariance[k:, k:],
+        state.setup, covariance[:COUNT, :COUNT], problem.residuals_px(state), used, scale,
+        2 * int(used.sum()) - COUNT, problem.camera(state).settings, state.lens, covariance[COUNT:, COUNT:],
     )  # fmt: skip
-
-
-def _scale(problem: SpotProblem, state: State) -> float:
-    """Robust standard deviation of one coordinate, corrected for the number of parameters."""
-    scale = robust_scale(problem.sizes(state), 2)
-    if not np.isfinite(scale):
-        raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
-    left = max(1.0 - len(PARAMETERS) / (2.0 * len(problem)), 0.25)
-    return max(scale / float(np.sqrt(left)), _LEAST)
 
 
 def with_held_lens(refined: Refined, problem: SpotProblem, lens: GivenCamera) -> Refined:
@@ -226,10 +207,10 @@ def with_held_lens(refined: Refined, problem: SpotProblem, lens: GivenCamera) ->
     state = problem.start(refined.setup)
     rows, _ = problem.with_pose_noise(state).linearised(state)
     rows = rows[refined.used].reshape(-1, problem.unknowns)
-    own = rows[:, : len(PARAMETERS)]
+    own = rows[:, :COUNT]
     size = np.linalg.norm(own, axis=0)
     # Least-squares response (13, p) to a change of the lens's free parameters.
-    by_lens = np.linalg.lstsq(own / size, rows[:, len(PARAMETERS) :], rcond=None)[0] / size[:, None]
+    by_lens = np.linalg.lstsq(own / size, rows[:, COUNT:], rcond=None)[0] / size[:, None]
     return replace(refined, covariance=refined.covariance + by_lens @ np.asarray(lens.covariance) @ by_lens.T)
 
 
@@ -253,8 +234,7 @@ class State:
     lens: Array
 
     def moved(self, change: Array) -> State:
-        count = len(PARAMETERS)
-        return State(self.setup.moved(change[:count]), self.lens + change[count:])
+        return State(self.setup.moved(change[:COUNT]), self.lens + change[COUNT:])
 
 
 class SpotProblem:
@@ -284,7 +264,7 @@ class SpotProblem:
     @property
     def unknowns(self) -> int:
         """Number of estimated parameters."""
-        return len(PARAMETERS) + len(self._root)
+        return COUNT + len(self._root)
 
     def start(self, setup: LaserSetup) -> State:
         """A state with the lens as calibrated."""
@@ -298,18 +278,14 @@ class SpotProblem:
         """The problem with the arm's noise added to the spots' covariances at a state."""
         if self._pose_noise is None:
             return self
-        spots, _ = spots_on_plane(state.setup, self.base_T_ee)
-        _, by_point = self.camera(state).project_with_jacobian(spots)
-        slopes = by_point @ pose_slopes(state.setup, self.base_T_ee)
-        added = slopes @ self._pose_noise.covariance() @ slopes.transpose(0, 2, 1)
+        by_arm = self._predicted(state)[2]
+        added = by_arm @ self._pose_noise.covariance() @ by_arm.transpose(0, 2, 1)
         added[~np.isfinite(added).all(axis=(1, 2))] = 0.0
-        out = SpotProblem(self._camera, self.base_T_ee, self.uv_px, self._spots_px2 + added, lens=self._lens)
-        out._pose_noise, out._spots_px2 = self._pose_noise, self._spots_px2
-        return out
+        return SpotProblem(self._camera, self.base_T_ee, self.uv_px, self._spots_px2 + added, lens=self._lens)
 
     def residuals_px(self, state: State) -> Array:
         """(n, 2), measured less predicted; NaN where the set-up puts no spot in front of the camera."""
-        spots, _ = spots_on_plane(state.setup, self.base_T_ee)
+        spots = in_camera(state.setup, spots_on_plane(state.setup, self.base_T_ee))
         return self.uv_px - self.camera(state).project(spots)
 
     def sizes(self, state: State) -> Array:
@@ -319,13 +295,7 @@ class SpotProblem:
 
     def linearised(self, state: State) -> tuple[Array, Array]:
         """Whitened rows (n, 2, p) and residuals (n, 2) at a state; zero where there is no spot."""
-        spots, slopes = spots_on_plane(state.setup, self.base_T_ee)
-        if self._lens is None:
-            uv_px, by_point = self._camera.project_with_jacobian(spots)
-            rows = by_point @ slopes
-        else:
-            uv_px, by_lens, by_point = self._lens.model.project(self._parameters(self._lens, state), spots)
-            rows = np.concatenate([by_point @ slopes, by_lens @ self._lens.free], axis=2)
+        uv_px, rows, _ = self._predicted(state)
         rows = self._whiten @ rows
         values = np.einsum("nij,nj->ni", self._whiten, self.uv_px - uv_px)
         good = np.isfinite(values).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
@@ -335,8 +305,19 @@ class SpotProblem:
     def prior(self, state: State) -> tuple[Array, Array]:
         """Whitened rows (p, unknowns) and residuals (p,) of the lens's prior."""
         rows = np.zeros((len(self._root), self.unknowns))
-        rows[:, len(PARAMETERS) :] = self._root
+        rows[:, COUNT:] = self._root
         return rows, -self._root @ state.lens
+
+    def _predicted(self, state: State) -> tuple[Array, Array, Array]:
+        """Pixels (n, 2), and their derivatives by the unknowns (n, 2, p) and by the arm's poses (n, 2, 6)."""
+        spots, slopes = spots_in_camera(state.setup, self.base_T_ee)
+        if self._lens is None:
+            uv_px, by_point = self._camera.project_with_jacobian(spots)
+            rows = by_point @ slopes
+            return uv_px, rows[:, :, :COUNT], rows[:, :, COUNT:]
+        uv_px, by_lens, by_point = self._lens.model.project(self._parameters(self._lens, state), spots)
+        rows = by_point @ slopes
+        return uv_px, np.concatenate([rows[:, :, :COUNT], by_lens @ self._lens.free], axis=2), rows[:, :, COUNT:]
 
     @staticmethod
     def _parameters(lens: GivenCamera, state: State) -> Array:

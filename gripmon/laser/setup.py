@@ -1,198 +1,186 @@
 """The set-up: a laser pointer on the end-effector, a plane that its spot falls on, and a fixed camera that sees the
-spot; also the file of its calibration.
+spot.  Each part is given in the frame in which it is fixed, so that what moves changes its own parameters only.
 
-The spot is where the laser's line meets the plane, laser-pointer method, equations (7) to (9).
+The spot is where the laser's line meets the plane: laser-pointer method, equations (7) to (9).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 
-from gripmon.model.camera import LensSettings
-from gripmon.model.geometry import from_record, invert, perturb, skew
-from gripmon.model.provenance import Provenance
-from gripmon.model.records import Array, Transform
+from gripmon.model.geometry import invert, perturb, skew
+from gripmon.model.records import Array
 
 PARAMETERS = (
-    "cam_T_base.x_m", "cam_T_base.y_m", "cam_T_base.z_m", "cam_T_base.rx_rad", "cam_T_base.ry_rad", "cam_T_base.rz_rad",
-    "plane.tilt_a_rad", "plane.tilt_b_rad", "plane.distance_m",
+    "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",
+    "base_T_cam.rx_rad", "base_T_cam.ry_rad", "base_T_cam.rz_rad",
+    "plane_base.tilt_a_rad", "plane_base.tilt_b_rad", "plane_base.distance_m",
     "laser.turn_a_rad", "laser.turn_b_rad", "laser.shift_a_m", "laser.shift_b_m",
 )  # fmt: skip
-"""The parameters that :meth:`LaserSetup.moved` changes: pose perturbation as elsewhere, then plane and laser line."""
+"""The parameters that :meth:`LaserSetup.moved` changes: camera (base axes), plane, laser line."""
+COUNT = len(PARAMETERS)
+CAMERA, PLANE, LASER = slice(0, 6), slice(6, 9), slice(9, 13)
+_PARALLEL = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class LaserSetup:
-    """``cam_T_base`` (4, 4); the plane ``normal_cam . p = distance_m`` with a unit normal (3,) away from the camera;
-    the laser line through ``point_ee_m`` (3,) along the unit vector ``direction_ee`` (3,), end-effector frame.
+    """``base_T_cam`` (4, 4); the plane ``normal_base . p = distance_base_m`` with a unit normal (3,) away from the
+    camera; the laser line through ``point_ee_m`` (3,) along the unit vector ``direction_ee`` (3,), end-effector frame.
     """
 
-    cam_T_base: Array
-    normal_cam: Array
-    distance_m: float
+    base_T_cam: Array
+    normal_base: Array
+    distance_base_m: float
     point_ee_m: Array
     direction_ee: Array
 
+    @classmethod
+    def seen(
+        cls, cam_T_base: Array, normal_cam: Array, distance_m: float, point_ee_m: Array, direction_ee: Array
+    ) -> LaserSetup:
+        """From the base's pose and the plane ``normal_cam . p = distance_m`` as the camera has them."""
+        base_T_cam = invert(cam_T_base)
+        normal_base = base_T_cam[:3, :3] @ normal_cam
+        distance_base_m = float(distance_m + normal_base @ base_T_cam[:3, 3])
+        return cls(base_T_cam, normal_base, distance_base_m, point_ee_m, direction_ee)
+
+    @property
+    def cam_T_base(self) -> Array:
+        """(4, 4)."""
+        return invert(self.base_T_cam)
+
+    @property
+    def normal_cam(self) -> Array:
+        """The plane's normal (3,), camera axes."""
+        out: Array = self.base_T_cam[:3, :3].T @ self.normal_base
+        return out
+
+    @property
+    def distance_cam_m(self) -> float:
+        """The plane's distance from the camera."""
+        return self.distance_base_m - float(self.normal_base @ self.base_T_cam[:3, 3])
+
     def moved(self, change: Array) -> LaserSetup:
-        """The set-up changed by small amounts (13,), in the order of :data:`PARAMETERS`.  The laser's point stays in
-        its plane: of the three planes spanned by end-effector axes, the one that the beam crosses most steeply.
+        """The set-up changed by (13,), in the order of :data:`PARAMETERS`, also by large amounts.  The laser's point
+        stays in its plane, equation (6): see :func:`origin_axes`.
         """
-        a, b = basis(self.normal_cam)
-        normal = self.normal_cam + change[6] * a + change[7] * b
-        c, e = basis(self.direction_ee)
-        direction = self.direction_ee + change[9] * c + change[10] * e
         point = self.point_ee_m.copy()
         point[list(origin_axes(self.direction_ee))] += change[11:13]
         return LaserSetup(
-            perturb(self.cam_T_base, change[:6]),
-            normal / np.linalg.norm(normal),
-            self.distance_m + float(change[8]),
+            perturb(self.base_T_cam, change[CAMERA]),
+            _tilted(self.normal_base, change[6:8]),
+            self.distance_base_m + float(change[8]),
             point,
-            direction / np.linalg.norm(direction),
+            _tilted(self.direction_ee, change[9:11]),
         )
 
 
 def basis(direction: Array) -> tuple[Array, Array]:
     """Two unit vectors (3,) orthogonal to a unit vector and to each other, right-handed with it; locally continuous."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     turn = skew(direction)  # because np.cross of single vectors is many times slower
-    a = turn @ helper
-    a /= np.linalg.norm(a)
+    a = turn[:, int(np.argmin(np.abs(direction)))]
+    a = a / np.linalg.norm(a)
     return a, turn @ a
 
 
+def _tilted(direction: Array, change: Array) -> Array:
+    a, b = basis(direction)
+    out: Array = direction + change[0] * a + change[1] * b
+    return out / np.linalg.norm(out)
+
+
 def origin_axes(direction_ee: Array) -> tuple[int, int]:
-    """The two axes of the end-effector that span the plane of the laser's point: of the three such planes, the one that
-    the beam crosses most steeply.
+    """The two axes of the end-effector that span the plane of the laser's point: of the three planes of equation (6),
+    the one that the beam crosses most steeply.
     """
     pierced = int(np.argmax(np.abs(direction_ee)))
     return ((1, 2), (0, 2), (0, 1))[pierced]
 
 
-def laser_lines(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
-    """Points and unit directions (n, 3), camera frame, of the beam at end-effector poses (n, 4, 4)."""
-    rotation, shift = setup.cam_T_base[:3, :3], setup.cam_T_base[:3, 3]
-    points = (base_T_ee[:, :3, :3] @ setup.point_ee_m + base_T_ee[:, :3, 3]) @ rotation.T + shift
-    return points, (base_T_ee[:, :3, :3] @ setup.direction_ee) @ rotation.T
+def beams(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
+    """Points and unit directions (n, 3), base frame, of the beam at end-effector poses (n, 4, 4)."""
+    turn = base_T_ee[:, :3, :3]
+    return turn @ setup.point_ee_m + base_T_ee[:, :3, 3], turn @ setup.direction_ee
 
 
-def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
-    """Intersections of laser line and plane, equations (7) to (9): spots (n, 3) in the camera frame, and their
-    derivatives (n, 3, 13) by :data:`PARAMETERS`; NaN where the beam runs along the plane.
+def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> Array:
+    """Beam and plane, equations (7) to (9): spots (n, 3), base frame; NaN where the beam runs along the plane."""
+    points, u = beams(setup, base_T_ee)
+    out: Array = points + _ways(setup, points, u)[:, None] * u
+    return out
+
+
+def in_camera(setup: LaserSetup, points_base: Array) -> Array:
+    """Points (n, 3) of the base frame in the camera's."""
+    out: Array = (points_base - setup.base_T_cam[:3, 3]) @ setup.base_T_cam[:3, :3]
+    return out
+
+
+def _ways(setup: LaserSetup, points: Array, directions: Array) -> Array:
+    """Equation (8): how far along lines (n,) the plane is; NaN where they run along it."""
+    steep = directions @ setup.normal_base
+    steep = np.where(np.abs(steep) > _PARALLEL * np.linalg.norm(directions, axis=-1), steep, np.nan)
+    out: Array = (setup.distance_base_m - points @ setup.normal_base) / steep
+    return out
+
+
+def spots_in_camera(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
+    """:func:`spots_on_plane` in the camera frame (n, 3), with derivatives (n, 3, 13 + 6) by :data:`PARAMETERS`, then by
+    a perturbation of each sample's own pose (position, rotation; base axes), which is the effect of the arm's errors.
     """
-    origin, u = laser_lines(setup, base_T_ee)
-    n = setup.normal_cam
-    steep = u @ n
-    steep = np.where(np.abs(steep) > 1e-9, steep, np.nan)
-    along = (setup.distance_m - origin @ n) / steep
-    spots = origin + along[:, None] * u
-    # A change of the line moves the spot within the plane: project the change onto it along the beam.
-    project = np.eye(3) - u[:, :, None] * n / steep[:, None, None]
-    slopes = np.zeros((len(spots), 3, len(PARAMETERS)))
-    slopes[:, :, :3] = project
-    # Rotating the base rotates the beam's origin and direction: the spot's lever arm starts at the origin of the base.
-    slopes[:, :, 3:6] = -project @ skew(spots - setup.cam_T_base[:3, 3])
-    a, b = basis(n)
-    for column, tilt in ((6, a), (7, b)):
-        slopes[:, :, column] = -u * ((spots @ tilt) / steep)[:, None]
-    slopes[:, :, 8] = u / steep[:, None]
-    cam_R_ee = setup.cam_T_base[:3, :3] @ base_T_ee[:, :3, :3]
-    c, e = basis(setup.direction_ee)
-    for column, turn in ((9, c), (10, e)):
-        slopes[:, :, column] = np.einsum("nij,nj->ni", project, (cam_R_ee @ turn) * along[:, None])
+    n, centre, base_R_ee = setup.normal_base, setup.base_T_cam[:3, 3], base_T_ee[:, :3, :3]
+    points, u = beams(setup, base_T_ee)
+    along = _ways(setup, points, u)[:, None]
+    spots = points + along * u
+    by_distance = u / (u @ n)[:, None]
+    # A change of the line moves the spot within the plane: the change's projection along the beam, G of equation (20).
+    project = np.eye(3) - by_distance[:, :, None] * n
+    slopes = np.empty((len(spots), 3, COUNT + 6))
+    slopes[:, :, :3] = -np.eye(3)
+    slopes[:, :, 3:6] = skew(spots - centre)
+    for column, tilt in zip((6, 7), basis(n), strict=True):
+        slopes[:, :, column] = -by_distance * (spots @ tilt)[:, None]
+    slopes[:, :, 8] = by_distance
+    for column, turn in zip((9, 10), basis(setup.direction_ee), strict=True):
+        slopes[:, :, column] = _each(project, along * (base_R_ee @ turn))
     for column, axis in zip((11, 12), origin_axes(setup.direction_ee), strict=True):
-        slopes[:, :, column] = np.einsum("nij,nj->ni", project, cam_R_ee[:, :, axis])
-    return spots, slopes
+        slopes[:, :, column] = _each(project, base_R_ee[:, :, axis])
+    slopes[:, :, COUNT : COUNT + 3] = project
+    slopes[:, :, COUNT + 3 :] = -project @ skew(spots - base_T_ee[:, :3, 3])
+    return in_camera(setup, spots), setup.base_T_cam[:3, :3].T @ slopes
 
 
-def pose_slopes(setup: LaserSetup, base_T_ee: Array) -> Array:
-    """Derivatives (n, 3, 6) of :func:`spots_on_plane` by a perturbation (position, then rotation; base axes) of each
-    sample's own pose: the effect of the arm's errors on the spot, camera frame.
+def _each(matrices: Array, vectors: Array) -> Array:
+    out: Array = np.einsum("nij,nj->ni", matrices, vectors)
+    return out
+
+
+def spots_on_rays(setup: LaserSetup, xy: Array) -> Array:
+    """Camera ray and plane, equations (10) to (12): spots (n, 3), base frame, of ideal image points (n, 2); NaN where a
+    ray doesn't meet the plane before the camera.
     """
-    origin, u = laser_lines(setup, base_T_ee)
-    steep = u @ setup.normal_cam
-    steep = np.where(np.abs(steep) > 1e-9, steep, np.nan)
-    along = (setup.distance_m - origin @ setup.normal_cam) / steep
-    project = np.eye(3) - u[:, :, None] * setup.normal_cam / steep[:, None, None]
-    cam_R_base = setup.cam_T_base[:3, :3]
-    # The spot's lever arm about the end-effector's origin, base axes: laser's point and beam together.
-    lever = base_T_ee[:, :3, :3] @ setup.point_ee_m + along[:, None] * (base_T_ee[:, :3, :3] @ setup.direction_ee)
-    slopes = np.empty((len(base_T_ee), 3, 6))
-    slopes[:, :, :3] = project @ cam_R_base
-    slopes[:, :, 3:] = -project @ cam_R_base @ skew(lever)
-    return slopes
+    centre = setup.base_T_cam[:3, 3]
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ setup.base_T_cam[:3, :3].T
+    depth = _ways(setup, centre, rays)
+    out: Array = centre + np.where(depth > 0.0, depth, np.nan)[:, None] * rays
+    return out
 
 
-Vector = tuple[float, float, float]
-_Length = Annotated[float, Meta(ge=0.0)]
-
-NAMES = (
-    "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",
-    "base_T_cam.rx_rad", "base_T_cam.ry_rad", "base_T_cam.rz_rad",
-    *PARAMETERS[6:],
-)  # fmt: skip
-"""Rows of a file's covariance: the camera's pose (position, then rotation, base axes), plane, laser line."""
-
-
-class Plane(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``normal . p = distance`` in the camera frame and in the base's; normals point away from the camera."""
-
-    normal_cam: Vector
-    distance_cam_m: float
-    normal_base: Vector
-    distance_base_m: float
-
-
-class LaserLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A point of the beam and its unit direction, end-effector frame."""
-
-    point_ee_m: Vector
-    direction_ee: Vector
-
-
-class LaserResiduals(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How well the spots fit."""
-
-    rms_px: Annotated[_Length, Meta(description="root mean square of the used residuals, u and v each (px)")]
-    sigma_px: Annotated[_Length, Meta(description="the spots' noise that they show, each axis (px)")]
-    spots: Annotated[int, Meta(ge=1)]
-    used: Annotated[int, Meta(ge=1)]
-    orientations: Annotated[int, Meta(ge=1)]
-    degrees_of_freedom: Annotated[int, Meta(ge=1)]
-    outliers: Annotated[tuple[str, ...], Meta(description="samples that were left out")] = ()
-
-
-class LaserCalibration(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
-    tag="gripmon.laser_calibration/1",
-):  # fmt: skip
-    """A laser calibration: ``base_T_cam``, plane and laser line; ``covariance`` (n·n, row by row) of the n
-    ``parameters``, ``sigmas`` the roots of its diagonal.  ``camera`` is the refined one if the lens was refined.
+def nearest_points(setup: LaserSetup, base_T_ee: Array, xy: Array) -> tuple[Array, Array]:
+    """Beam and camera ray, equations (13) and (14): the rays' points nearest to the beams, and the beams' nearest to
+    the rays, (n, 3) each, base frame; NaN where both are parallel.  No plane is needed: it may have moved.
     """
-
-    camera: LensSettings
-    base_T_cam: Transform
-    plane: Plane
-    laser: LaserLine
-    parameters: tuple[str, ...]
-    sigmas: dict[str, float]
-    covariance: tuple[float, ...]
-    residuals: LaserResiduals
-    warnings: tuple[str, ...] = ()
-    provenance: Provenance
-
-
-def setup_of(calibration: LaserCalibration) -> LaserSetup:
-    """The set-up that a file describes."""
-    return LaserSetup(
-        invert(from_record(calibration.base_T_cam)),
-        np.array(calibration.plane.normal_cam),
-        calibration.plane.distance_cam_m,
-        np.array(calibration.laser.point_ee_m),
-        np.array(calibration.laser.direction_ee),
-    )
+    centre = setup.base_T_cam[:3, 3]
+    points, u = beams(setup, base_T_ee)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ setup.base_T_cam[:3, :3].T
+    # The gap between them is orthogonal to both.
+    across = rays - u * np.einsum("ni,ni->n", rays, u)[:, None]
+    square = np.einsum("ni,ni->n", across, across)
+    square = np.where(square > _PARALLEL * np.einsum("ni,ni->n", rays, rays), square, np.nan)
+    depth = np.einsum("ni,ni->n", across, points - centre) / square
+    on_rays = centre + depth[:, None] * rays
+    on_beams = points + u * np.einsum("ni,ni->n", on_rays - points, u)[:, None]
+    return on_rays, on_beams

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from gripmon.laser.setup import LaserSetup, laser_lines, spots_on_plane
+from gripmon.laser.setup import LaserSetup, beams, spots_on_plane
 from gripmon.model.atomic import write_atomically
 from gripmon.model.camera import LensSettings
-from gripmon.model.geometry import invert
 from gripmon.model.records import Array
 from gripmon.record.columns import Colour, Sender, pinhole
 
@@ -29,9 +28,8 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
     recording = rr.RecordingStream("gripmon_laser")
     memory = recording.memory_recording()  # rerun's file sink doesn't report a full disk
     setup, log = refined.setup, Sender(recording).static
-    turn, centre = _log_camera(Sender(recording), setup, refined.camera)
-    spots = spots_on_plane(setup, base_T_ee)[0] @ turn.T + centre
-    origins = laser_lines(setup, base_T_ee)[0] @ turn.T + centre
+    _log_camera(Sender(recording), setup, refined.camera)
+    spots, origins = spots_on_plane(setup, base_T_ee), beams(setup, base_T_ee)[0]
     seen = np.isfinite(spots).all(axis=1)
     colours = [_USED if used else _LEFT_OUT for used in refined.used]
     log("base", rr.Transform3D(translation=[0.0, 0.0, 0.0]))
@@ -39,10 +37,9 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
     shown = [colours[k] for k in np.flatnonzero(seen)]
     log("base/spots", rr.Points3D(spots[seen], colors=shown, radii=0.002))
     log("base/beams", rr.LineStrips3D(np.stack([origins[seen], spots[seen]], axis=1), colors=_BEAM, radii=0.0005))
-    normal = turn @ setup.normal_cam
     middle = np.median(spots[seen], axis=0)
     side = max(_PLANE_MARGIN * float(np.linalg.norm(spots[seen] - middle, axis=1).max()), _PLANE_LEAST_M)
-    log("base/plane", _plane(_plane_corners(normal, middle, side), _PLANE))
+    log("base/plane", _plane(_plane_corners(setup.normal_base, middle, side), _PLANE))
     log("base/camera/image/spots", rr.Points2D(uv_px, colors=colours, radii=2.0))
     lines = np.stack([uv_px, uv_px - refined.residuals_px], axis=1)[seen]
     log("base/camera/image/residuals", rr.LineStrips2D(lines, colors=_LEFT_OUT))
@@ -50,13 +47,10 @@ def write_calibration(path: Path, refined: Refined, base_T_ee: Array, uv_px: Arr
     recording.disconnect()
 
 
-def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> tuple[Array, Array]:
-    """Log the camera and its image; returns its rotation (3, 3) and position (3,) in the base frame."""
-    base_T_cam = invert(setup.cam_T_base)
-    turn, centre = base_T_cam[:3, :3], base_T_cam[:3, 3]
-    send.static("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
-    send.static(IMAGE, pinhole(lens, 0.3 * setup.distance_m))
-    return turn, centre
+def _log_camera(send: Sender, setup: LaserSetup, lens: LensSettings) -> None:
+    base_T_cam = setup.base_T_cam
+    send.static("base/camera", rr.Transform3D(translation=base_T_cam[:3, 3], mat3x3=base_T_cam[:3, :3]))
+    send.static(IMAGE, pinhole(lens, 0.3 * setup.distance_cam_m))
 
 
 def _plane_corners(normal: Array, middle: Array, side: float) -> Array:

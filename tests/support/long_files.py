@@ -24,7 +24,7 @@ LONGEST = (
     "test_vector_code",
     "test_cli",
     "test_curved_edges",
-    "test_spotwatch",
+    "test_laser_check",
     "test_look",
     "test_response",
     "test_shadow",

@@ -22,13 +22,12 @@ from gripmon.laser.closed_form import (
     FEWEST_SHIFTS,
     FLAT,
     Orientation,
-    _shifts_of,
     beam_in_hand,
     check_spots,
     positions,
     usable_orientations,
 )
-from gripmon.laser.setup import LaserSetup, basis, laser_lines
+from gripmon.laser.setup import LaserSetup, basis
 from gripmon.model.geometry import make_transform
 
 Array = NDArray[np.float64]
@@ -54,7 +53,7 @@ def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None
     distance = plane_distance(usable, scales, normal, base_T_ee)
     if distance < 0.0:
         normal, distance = -normal, -distance
-    return LaserSetup(make_transform(cam_R_base, shift), normal, distance, point, direction)
+    return LaserSetup.seen(make_transform(cam_R_base, shift), normal, distance, point, direction)
 
 
 def spot_matrix(xy: Array, shifts_m: Array) -> Array:
@@ -146,7 +145,8 @@ def consistent_beams(candidates: Sequence[tuple[BeamCandidate, BeamCandidate]]) 
 def plane_distance(orientations: Sequence[Orientation], scales: Array, normal: Array, base_T_ee: Array) -> float:
     """Step 8, equation (34): the mean of nᵀ p over all spots (m)."""
     distances = []
-    for orientation, scale, shifts in zip(orientations, scales, _shifts_of(orientations, base_T_ee), strict=True):
+    for orientation, scale in zip(orientations, scales, strict=True):
+        shifts = base_T_ee[orientation.members, :3, 3] - orientation.centre_m
         spots = scale * np.concatenate([shifts, np.ones((len(shifts), 1))], axis=1) @ orientation.matrix.T
         distances.append(spots @ normal)
     return float(np.mean(np.concatenate(distances)))
@@ -160,37 +160,3 @@ def _rotation_of(rows: Array, turned: Array) -> Array:
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     out: Array = left @ flip @ right
     return out
-
-
-def spots_on_rays(setup: LaserSetup, xy: Array) -> tuple[Array, Array]:
-    """Camera ray and plane, equations (10) to (12): spots (n, 3) in the camera frame of ideal image points (n, 2), and
-    their derivatives (n, 3, 2) by these; NaN where a ray doesn't meet the plane before the camera.
-    """
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    n = setup.normal_cam
-    steep = rays @ n
-    depth = setup.distance_m / np.where(np.abs(steep) > 1e-9, steep, np.nan)
-    depth = np.where(depth > 0.0, depth, np.nan)
-    spots = depth[:, None] * rays
-    slopes = depth[:, None, None] * (np.eye(3)[None, :, :2] - rays[:, :, None] * n[:2] / steep[:, None, None])
-    return spots, slopes
-
-
-def spots_between(setup: LaserSetup, base_T_ee: Array, xy: Array) -> tuple[Array, Array, Array]:
-    """Laser line and camera ray, equations (13) and (14): the points of the rays (n, 3) that the lines come nearest to,
-    the distances (n,) that are left between them (m), and the depths' derivatives (n, 2) by the image points; NaN where
-    both are parallel.  No plane is needed: it may have moved.
-    """
-    origin, u = laser_lines(setup, base_T_ee)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    # The depth z at which z ray is nearest to the line: (I - u uᵀ)(z ray - origin) has its least length.
-    across = rays - u * np.einsum("ni,ni->n", rays, u)[:, None]
-    size = np.einsum("ni,ni->n", across, across)
-    size = np.where(size > 1e-12, size, np.nan)
-    depth = np.einsum("ni,ni->n", across, origin) / size
-    left = depth[:, None] * rays - origin
-    left = left - u * np.einsum("ni,ni->n", left, u)[:, None]
-    # d(depth) of d(xy): the quotient's derivative, the projection being its own square.
-    flat = origin - u * np.einsum("ni,ni->n", origin, u)[:, None]
-    slopes = (flat[:, :2] - 2.0 * depth[:, None] * across[:, :2]) / size[:, None]
-    return depth[:, None] * rays, np.linalg.norm(left, axis=1), slopes

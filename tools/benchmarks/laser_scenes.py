@@ -27,7 +27,7 @@ class LaserData:
 
 def paper_setup(rng: np.random.Generator) -> LaserSetup:
     """The paper's simulation."""
-    return LaserSetup(**vars(paper_cell(rng)))
+    return LaserSetup.seen(**vars(paper_cell(rng)))
 
 
 REAL_LENS = BrownConradyLens(
@@ -48,7 +48,7 @@ def real_setup(rng: np.random.Generator) -> LaserSetup:
     theta, phi = np.radians([-1.80, 53.39])
     beam = np.array([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)])
     normal = normal * np.sign(normal[2])
-    return LaserSetup(invert(base_T_cam), normal, 0.72 * float(normal[2]), np.array([0.0, -0.010, 0.030]), beam)
+    return LaserSetup.seen(invert(base_T_cam), normal, 0.72 * float(normal[2]), np.array([0.0, -0.010, 0.030]), beam)
 
 
 def sampled(
@@ -57,7 +57,7 @@ def sampled(
 ) -> LaserData:  # fmt: skip
     """Ten spots an orientation: a first pose and three shifts along each of three random directions."""
     camera = make_camera(lens)
-    cell = LaserCell(setup.cam_T_base, setup.normal_cam, setup.distance_m, setup.point_ee_m, setup.direction_ee)
+    cell = LaserCell(setup.cam_T_base, setup.normal_cam, setup.distance_cam_m, setup.point_ee_m, setup.direction_ee)
     base_T_ee, group = poses_on_plane(
         cell, camera, rng, orientations=orientations, reach_m=reach_m, tilt_deg=tilt_deg, shift_m=shift_m
     )

@@ -18,7 +18,7 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser import closed_form
 from gripmon.laser.refinement import SpotProblem, refine
 from gripmon.laser.setup import LaserSetup
-from gripmon.model.geometry import inverse_jacobian, invert, make_transform, perturbation_between
+from gripmon.model.geometry import invert, make_transform, perturbation_between
 
 Array = NDArray[np.float64]
 
@@ -107,9 +107,8 @@ def _laser(
         return Trial({**errors, "refined": None})
     ended, wall_s = time.process_time(), time.perf_counter() - clock
     errors["refined"] = relative_errors(found.setup.cam_T_base, truth)
-    change = inverse_jacobian(found.setup.cam_T_base)
-    xi = perturbation_between(invert(found.setup.cam_T_base), invert(truth))
-    size = float(xi @ np.linalg.solve(change @ found.covariance[:6, :6] @ change.T, xi)) if noise_px else 0.0
+    xi = perturbation_between(found.setup.base_T_cam, invert(truth))
+    size = float(xi @ np.linalg.solve(found.covariance[:6, :6], xi)) if noise_px else 0.0
     bound = _bound(problem, data.truth, noise_px, ~wrong)
     return Trial(
         errors,
@@ -128,8 +127,7 @@ def _bound(problem: SpotProblem, truth: LaserSetup, noise_px: float, good: NDArr
     rows = problem.linearised(problem.start(truth))[0][good].reshape(-1, 13)
     size = np.linalg.norm(rows, axis=0)
     covariance = np.linalg.inv((rows / size).T @ (rows / size)) / np.outer(size, size)
-    change = inverse_jacobian(truth.cam_T_base)
-    out: Array = max(noise_px, _LEAST_NOISE_PX) ** 2 * change @ covariance[:6, :6] @ change.T
+    out: Array = max(noise_px, _LEAST_NOISE_PX) ** 2 * covariance[:6, :6]
     return out
 
 
