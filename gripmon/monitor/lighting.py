@@ -16,8 +16,6 @@ ANOTHER_LIGHT = math.log(2.0)
 """Change of the logarithm of grey levels by which a light is another one: a stop, of the two or three that lamp, shade
 and hand make of a workplace.  Small changes shift edges in proportion.
 """
-LEAST_KEPT = 0.5
-"""Share of a light that is left, under which what follows is compared with another one."""
 DARKEST = 8.0
 """Grey level under which shading isn't told by its logarithm: several times the noise of a camera."""
 
@@ -61,6 +59,6 @@ class Lighting:
         before, self._kept = self._kept, math.exp(-0.5 * square / ANOTHER_LIGHT**2)
         self._then = np.where(both, self._then, now)
         out = min(self._kept / before, 1.0)
-        if self._kept < LEAST_KEPT:
+        if square > ANOTHER_LIGHT**2:  # what follows is compared with this one
             self._then, self._kept = now, 1.0
         return out
