@@ -13,10 +13,10 @@ from scipy.stats import chi2, ncx2
 from benchmarks.offline_images import DISCS, OPENING_M, Setting, gripper
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.intrinsics import calibrate_single_view
 from gripmon.calibrate.plane import Coincidence, KnownCorners, calibrate_plane
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.single_view import calibrate_single_view
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
