@@ -118,7 +118,7 @@ def solve(way: str, setting: Setting, image: Image, sight: Sighting, rng: np.ran
         single = calibrate_single_view(sight)
         camera = GivenCamera(single.camera, single.parameters, single.covariance)
     if way == "inferred":
-        return UnknownGripper(camera, DISCS).measure(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
+        return UnknownGripper(camera).measure(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
     known = KnownGripper(camera, gripper(), OPENING_M)
     return known.measure(image, sight, _rough(setting, {name: (name, None) for name in _SEEN}, rng)).coincidence
 
