@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from gripmon.calibrate.grey_levels import Grey
-from gripmon.calibrate.lattice import Index, find_lattice, fits
+from gripmon.calibrate.lattice import Index, find_lattice, fits, trimmed
 from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)
@@ -73,6 +74,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
             if not lattice:
                 break
             chosen = np.array(list(lattice.values()))
+            lattice = trimmed(_wide(grey, candidates, lattice), columns, rows)
             found = {cell: (float(candidates[i, 0]), float(candidates[i, 1])) for cell, i in lattice.items()}
             contrast = float(np.abs(second[list(lattice.values())]).sum())
             if fits(found, columns, rows, least=2):
@@ -85,6 +87,15 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
         if len(best) == columns * rows:
             break
     return [best or max(others, key=len)] if best or others else []
+
+
+def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Index, int]:
+    """Test again with rings as wide as the squares allow: corners of the board's rim don't belong to its lattice."""
+    indices = np.array(list(lattice.values()))
+    steps = cKDTree(candidates[indices]).query(candidates[indices], 2)[0][:, 1]
+    good, _ = crossing(grey, candidates[indices], 0.35 * steps)
+    kept = set(indices[good].tolist())
+    return {cell: index for cell, index in lattice.items() if index in kept}
 
 
 def saddles(grey: Grey, sigma_px: float) -> Array:

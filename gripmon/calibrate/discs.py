@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gripmon.calibrate.grey_levels import Grey, to_bytes
-from gripmon.calibrate.lattice import Index, find_lattice, fits
+from gripmon.calibrate.lattice import Index, find_lattice, fits, trimmed
 from gripmon.model.records import Array
 
 SMALLEST_PX = 4.0
@@ -91,6 +91,7 @@ def _search(
                 if not lattice:
                     break
                 chosen = np.array(list(lattice.values()))
+                lattice = trimmed(lattice, columns, rows)
                 found = {cell: Disc(centres[i], spreads[i], dark) for cell, i in lattice.items()}
                 if fits(found, columns, rows):
                     best = max(best, found, key=len)

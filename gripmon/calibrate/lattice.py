@@ -58,8 +58,34 @@ def find_lattice(points_px: Array, rules: LatticeRules) -> dict[Index, int]:
                 best = grown
         if len(best) > 0.5 * len(points_px) or count >= SEEDS:
             break
+    best = _consistent(points_px, best)
     columns, rows = extent(best)
     return best if min(columns, rows) >= 3 and len(best) >= 9 else {}
+
+
+def trimmed(lattice: dict[Index, int], columns: int, rows: int) -> dict[Index, int]:
+    """Remove sparse outermost lines while the lattice is larger than ``columns`` x ``rows``, in either orientation:
+    those are points beside the target that fit by chance.
+    """
+    out = dict(lattice)
+    while out:
+        seen = extent(out)
+        excess = min(
+            ((seen[0] - columns, seen[1] - rows), (seen[0] - rows, seen[1] - columns)),
+            key=lambda e: max(e[0], 0) + max(e[1], 0),
+        )
+        lines: list[tuple[int, int, int]] = []
+        for axis in (0, 1):
+            if excess[axis] > 0:
+                places = [cell[axis] for cell in out]
+                lines += [(places.count(place), axis, place) for place in (min(places), max(places))]
+        if not lines:
+            return out
+        fewest, axis, place = min(lines)
+        if fewest >= 0.5 * len(out) / seen[axis]:
+            return out
+        out = {cell: index for cell, index in out.items() if cell[axis] != place}
+    return out
 
 
 def extent(lattice: dict[Index, int]) -> tuple[int, int]:
@@ -132,6 +158,21 @@ def _own_steps(points: Array, found: dict[Index, int], at: Index, otherwise: Arr
         neighbour = (at[0] + dx, at[1] + dy)
         if neighbour in found:
             out[0 if dx else 1] = (points[found[neighbour]] - points[found[at]]) * (dx + dy)
+    return out
+
+
+def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
+    """Remove points that lie off the midpoint of two neighbours on a line: they met a prediction by chance."""
+    out = dict(lattice)
+    for at, index in lattice.items():
+        for axis in (0, 1):
+            before = (at[0] - 1, at[1]) if axis == 0 else (at[0], at[1] - 1)
+            after = (at[0] + 1, at[1]) if axis == 0 else (at[0], at[1] + 1)
+            if before in lattice and after in lattice:
+                low, high = points[lattice[before]], points[lattice[after]]
+                off = np.hypot(*(points[index] - 0.5 * (low + high)))
+                if off > 0.12 * float(np.hypot(*(high - low))):
+                    out.pop(at, None)
     return out
 
 
