@@ -11,11 +11,12 @@ from scipy.stats import chi2
 from support.sightings import CAMERAS, PLATE_M, poses, seen
 
 from gripmon.calibrate import api, bundle
-from gripmon.calibrate.bundle import plate_pose
 from gripmon.calibrate.cross_validation import cross_validate
-from gripmon.calibrate.intrinsics import calibrate, calibrate_best, calibrate_single_view, doubts_of
+from gripmon.calibrate.intrinsics import calibrate, calibrate_best, doubts_of
 from gripmon.calibrate.lens_models import MODELS, lens_vector
+from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.single_view import calibrate_single_view
 from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import exp_rotation, log_rotation
 from gripmon.model.targets import TargetError

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import chi2
 from support.sightings import CAMERAS, poses, seen
 
-from gripmon.calibrate.bundle import plate_pose
 from gripmon.calibrate.intrinsics import calibrate
 from gripmon.calibrate.lens_models import MODELS, LensModel, ModelName, lens_vector, parameter_names
+from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import log_rotation
 

@@ -13,9 +13,10 @@ from scipy.stats import binom, chi2
 from support.plate_views import CORNERS_M, EXACT, LENS, NAMES, Trial, moved, seen_by, solved, transform, trial
 
 from gripmon.calibrate import plane
-from gripmon.calibrate.bundle import GivenCamera, plate_pose
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.plane import FingerCorners, corners_of, lengths_of
 from gripmon.calibrate.plane_equations import back_project, coincide_linear, infer_rectangle, stand
+from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between

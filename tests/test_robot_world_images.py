@@ -13,9 +13,10 @@ import yaml
 from support.plates import pose, render
 from test_robot_world import columns, transform
 
-from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.plate_pose import plate_pose, pose_slopes
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.cli import main
 from gripmon.model.camera import BrownConradyLens, make_camera

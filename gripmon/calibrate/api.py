@@ -29,6 +29,7 @@ from gripmon.calibrate.lens_models import MODELS, ModelName, parameter_names
 from gripmon.calibrate.markers import other_dictionary
 from gripmon.calibrate.robot_world import RobotWorld
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.single_view import calibrate_single_view
 from gripmon.calibrate.verify import verify
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
@@ -219,7 +220,7 @@ def _fitted(
     if wanted is not None and wanted != "auto":
         model = wanted
     if single:
-        return intrinsics.calibrate_single_view(sightings[0], model, fixed=fixed)
+        return calibrate_single_view(sightings[0], model, fixed=fixed)
     steps = (len(MODELS) if wanted == "auto" else 1) + min(_FOLDS, len(sightings)) * (len(sightings) > 3)
     with progress(steps, "fit") as step:
         if wanted == "auto":

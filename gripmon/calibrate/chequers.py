@@ -25,7 +25,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.lattice import Grey, Index, find_lattice, fits, trimmed
+from gripmon.calibrate.grey_levels import Grey
+from gripmon.calibrate.lattice import Index, find_lattice, fits, trimmed
 from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)

@@ -10,9 +10,10 @@ from types import MappingProxyType
 import numpy as np
 from scipy.special import chdtri
 
-from gripmon.calibrate.bundle import BundleProblem, plate_pose_start
+from gripmon.calibrate.bundle import BundleProblem
 from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult, calibrate, doubts_of
 from gripmon.calibrate.lens_models import PINHOLE, LensModel, ModelName, lens_vector
+from gripmon.calibrate.plate_pose import plate_pose_start
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.target_shape import CHANCE, FEWEST_VIEWS
 

@@ -13,18 +13,9 @@ from scipy.spatial import cKDTree
 
 from gripmon.calibrate import chequers
 from gripmon.calibrate.chequers import bends
-from gripmon.calibrate.lattice import (
-    Grey,
-    Index,
-    edge_blur_px,
-    find_discs,
-    fits,
-    noise_of,
-    refined,
-    sharpest_blur_px,
-    to_bytes,
-    to_grey,
-)
+from gripmon.calibrate.discs import find_discs, refined
+from gripmon.calibrate.grey_levels import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
+from gripmon.calibrate.lattice import Index, fits
 from gripmon.calibrate.markers import marked_corners
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.calibrate.staggered import lattice_of, places_of

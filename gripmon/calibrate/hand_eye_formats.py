@@ -4,22 +4,26 @@ files, commands of ``static_transform_publisher``, URDF, and gripmon's own JSON.
 
 from __future__ import annotations
 
-import contextlib
 import re
-import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from gripmon.calibrate.foreign import Document, FileValues, InterchangeError, shown
-from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, invert, make_transform, rotation_from_xyzw
+from gripmon.calibrate.foreign import Document, FileValues, InterchangeError
+from gripmon.calibrate.static_transforms import (
+    FIXED,
+    QUATERNION,
+    FramePair,
+    checked_pose,
+    from_angles,
+    published_transforms,
+)
+from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
 
-_ANGLES, _QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
 _READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publisher or URDF"
 FARTHEST_M = 5.0
 """Distance of a gripper from its wrist camera beyond which another unit was meant."""
@@ -28,7 +32,6 @@ TCP_FRAME = "gripper_tcp"
 any other frame, a file of these formats doesn't say.
 """
 BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up) instead of a camera's (z forward)"
-_FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
 _BASE = re.compile(
     r"(?!.*(?:grip|hand|tool|flange|tcp|finger|jaw|robotiq|wsg|schunk|onrobot|rg[26]|[23]f[_\d]))(?:.*[_/])?"
@@ -87,25 +90,7 @@ def read_hand_eye(document: Document, *, which: str | None = None) -> ForeignHan
     return hand_eye
 
 
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """A transform between two frames, which is read when it is asked for: a file may hold others that can't be read.
-    ``camera``: which of them is the camera's, if the file says it.
-    """
-
-    kind: str
-    parent: str
-    child: str
-    parent_T_child: Callable[[], Array]
-    camera: str | None = None
-    covariance: tuple[float, ...] | None = None
-
-    @property
-    def frames(self) -> tuple[str, str]:
-        return self.parent, self.child
-
-
-def _likely(found: Sequence[_Pair]) -> list[_Pair]:
+def _likely(found: Sequence[FramePair]) -> list[FramePair]:
     """Those that end in a camera's last frame by their names; all ends where no name is a camera's."""
     above = {one.parent for one in found if _CAMERA.search(one.child) or not _CAMERA.search(one.parent)}
     ends = [one for one in found if one.child not in above]
@@ -117,7 +102,7 @@ def _likely(found: Sequence[_Pair]) -> list[_Pair]:
     )
 
 
-def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
+def _chosen(file: str, found: Sequence[FramePair], which: str | None) -> FramePair:
     """The transform that ends in the camera's frame: the one with that name, or the only likely one."""
     chosen = likely = _likely(found)
     if which is not None:
@@ -129,7 +114,7 @@ def _chosen(file: str, found: Sequence[_Pair], which: str | None) -> _Pair:
     return chosen[0]
 
 
-def _joined(file: str, pair: _Pair, found: Sequence[_Pair]) -> _Pair:
+def _joined(file: str, pair: FramePair, found: Sequence[FramePair]) -> FramePair:
     """The transform from the first frame above that isn't the camera's own: what lies between is its mount."""
     chain = [pair]
     while pair.camera is None and _CAMERA.search(chain[0].parent):
@@ -149,7 +134,7 @@ def _product(transforms: Iterable[Array]) -> Array:
     return reduce(np.matmul, transforms)
 
 
-def _turned(file: str, pair: _Pair, which: str | None) -> ForeignHandEye:
+def _turned(file: str, pair: FramePair, which: str | None) -> ForeignHandEye:
     """From the gripper to the camera, whichever of both is the parent."""
     own = [bool(_CAMERA.search(name)) for name in pair.frames]
     if pair.camera is None and all(own):
@@ -179,7 +164,7 @@ def _refuse_fixed(file: str, hand_eye: ForeignHandEye, which: str | None, alone:
     else:
         return
     wrong = f"leads from {gripper} to {camera}"
-    raise InterchangeError(file, "", wrong, f"{_FIXED}; if {gripper} moves with the camera: {way_out}")
+    raise InterchangeError(file, "", wrong, f"{FIXED}; if {gripper} moves with the camera: {way_out}")
 
 
 def _body(cam_T_grip: Array, name: str) -> bool | None:
@@ -206,8 +191,8 @@ def lies_along_x(cam_t_tcp: Array) -> bool:
     return bool(x > max(abs(y), abs(z)))
 
 
-def _transforms(document: Document) -> Iterator[_Pair]:
-    if "static_transform_publisher" in document.text and (published := list(_published(document))):
+def _transforms(document: Document) -> Iterator[FramePair]:
+    if "static_transform_publisher" in document.text and (published := list(published_transforms(document))):
         yield from published
         return
     if document.text.lstrip().startswith("<"):
@@ -224,37 +209,37 @@ def _transforms(document: Document) -> Iterator[_Pair]:
         yield _own_json(values)
 
 
-def _easy_handeye(values: FileValues) -> _Pair:
+def _easy_handeye(values: FileValues) -> FramePair:
     """Version 1 has ``transformation`` (x … qw), ``eye_on_hand``; version 2 ``transform``, ``calibration_type``."""
     first = "transformation" in values.content
     told = values.below("parameters") if "parameters" in values.content else values
     on_hand = told.content.get("eye_on_hand", True) if first else told.content.get("calibration_type") == "eye_in_hand"
     frames = [str(told.content.get(f"{name}_frame", name)) for name in ("robot_effector", "tracking_base")]
     if not on_hand:
-        raise values.fault("", f"leads from the robot's base to {frames[1]}", _FIXED)
+        raise values.fault("", f"leads from the robot's base to {frames[1]}", FIXED)
     if first:
         shift = turn = values.below("transformation")
-        keys = _QUATERNION
+        keys = QUATERNION
     else:
         shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
         keys = ("x", "y", "z", "w")
-    pose = _pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
-    return _Pair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], lambda: pose, frames[1])
+    pose = checked_pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
+    return FramePair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], lambda: pose, frames[1])
 
 
-def _own_json(values: FileValues) -> _Pair:
+def _own_json(values: FileValues) -> FramePair:
     part = values.below("cam_T_grip")
     shift = part.numbers("translation_m", (3,), "x, y, z")
-    pose = _pose(part, shift, part.numbers("rotation_xyzw", (4,), "x, y, z, w"))
+    pose = checked_pose(part, shift, part.numbers("rotation_xyzw", (4,), "x, y, z, w"))
     parent, child = (str(values.value(f"{name}_frame")) for name in ("parent", "child"))
     matrix = values.below("parent_T_child").numbers("matrix", (16,), "4 x 4 numbers")
     # With --gripper-in-camera, the camera's frame is the parent.
     camera, gripper = (parent, child) if np.allclose(np.reshape(matrix, (4, 4)), pose, atol=1e-9) else (child, parent)
     covariance = values.numbers("covariance", (36,), "6 x 6 numbers")
-    return _Pair("json", camera, gripper, lambda: pose, camera, covariance)
+    return FramePair("json", camera, gripper, lambda: pose, camera, covariance)
 
 
-def _joints(document: Document) -> Iterator[_Pair]:
+def _joints(document: Document) -> Iterator[FramePair]:
     """Fixed joints of a URDF."""
     try:
         root = ElementTree.fromstring(document.text)
@@ -264,7 +249,7 @@ def _joints(document: Document) -> Iterator[_Pair]:
         parent, child = (joint.find(name) for name in ("parent", "child"))
         if joint.get("type") == "fixed" and parent is not None and child is not None:
             pose = partial(_joint, document.file, joint)
-            yield _Pair("urdf", parent.get("link", ""), child.get("link", ""), pose)
+            yield FramePair("urdf", parent.get("link", ""), child.get("link", ""), pose)
 
 
 def _joint(file: str, joint: ElementTree.Element) -> Array:
@@ -275,136 +260,4 @@ def _joint(file: str, joint: ElementTree.Element) -> Array:
     if any("}" in part.tag for part in joint):
         raise values.fault("", "holds parts of xacro", "the URDF that xacro makes of it")
     shift, turn = (values.numbers(key, (3,), "3 numbers") for key in ("xyz", "rpy"))
-    return make_transform(_from_angles(*turn), np.array(shift))
-
-
-_COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
-_NODE = re.compile(r"<node\b[^>]*>")
-_CALL = re.compile(r"\bNode\(")
-_MARK = re.compile(r""""(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|#[^\n]*|[()]""")
-_EXECUTABLE = re.compile(r"""\b(?:(?:node_)?exec(?:utable)?|type)\s*=\s*["']static_transform_publisher["']""")
-_ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
-_ARGS = re.compile(r"""\bargs\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-_LINE = re.compile(r"(?:^|[\s/])static_transform_publisher[ \t]+([^\n]*)", re.MULTILINE)
-_SHELL = re.compile(r"\s#|\s\d>|[;&|<>]")
-"""Ends a command: a comment, another command, where its output goes."""
-_WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
-
-
-def _published(document: Document) -> Iterator[_Pair]:
-    """``static_transform_publisher`` in a shell's line, or in a launch file (Python, XML, YAML), such as MoveIt's."""
-    kind = "moveit" if "MoveIt" in document.text or "camera_link_broadcaster" in document.text else "static transform"
-    if "EYE-TO-HAND" in document.text:
-        raise InterchangeError(document.file, "", "says EYE-TO-HAND", _FIXED)
-    for command in _commands(document):
-        try:
-            words = shlex.split(command) if isinstance(command, str) else command
-        except ValueError as error:
-            raise InterchangeError(document.file, "", f"can't be read ({error})", _PUBLISHED) from None
-        yield _command(document.file, kind, words)
-
-
-def _commands(document: Document) -> Iterator[str | list[str]]:
-    """The arguments of each node with this executable, whatever its name; or of each line of a shell."""
-    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
-    if text.lstrip().startswith("<"):
-        for node in filter(_EXECUTABLE.search, _NODE.findall(text)):
-            args = _ARGS.search(node)
-            yield "" if args is None else args[1] or args[2] or ""
-    elif _CALL.search(text):
-        for node in filter(_EXECUTABLE.search, _calls(text)):
-            listed = _ARGUMENTS.search(node)
-            inside = "" if listed is None else re.sub(r"#[^\n]*", "", listed[1])
-            yield [quoted or bare for quoted, bare in _WORD.findall(inside)]
-    else:
-        nodes: list[str] = []
-        with contextlib.suppress(InterchangeError, RecursionError):  # no YAML
-            nodes = _yaml_nodes(document.content)
-        yield from nodes or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
-
-
-def _calls(text: str) -> Iterator[str]:
-    """Each ``Node(…)`` of a Python file, to its closing bracket."""
-    begin = _CALL.search(text)
-    while begin is not None:
-        depth, end = 0, len(text)
-        for mark in _MARK.finditer(text, begin.start()):
-            depth += {"(": 1, ")": -1}.get(mark[0], 0)
-            if depth == 0 and mark[0] == ")":
-                end = mark.end()
-                break
-        yield text[begin.start() : end]
-        begin = _CALL.search(text, end)
-
-
-def _yaml_nodes(content: Any) -> list[str]:
-    parts = list(content.values()) if isinstance(content, Mapping) else content if isinstance(content, list) else []
-    if isinstance(content, Mapping) and content.get("exec") == "static_transform_publisher":
-        return [str(content.get("args", ""))]
-    return [args for part in parts for args in _yaml_nodes(part)]
-
-
-_PUBLISHED = (
-    "--x --y --z, --qx … --qw or --roll --pitch --yaw, --frame-id PARENT --child-frame-id CHILD; or "
-    "x y z qx qy qz qw PARENT CHILD"
-)
-_OPTIONS = ("x", "y", "z", *_QUATERNION, *_ANGLES, "frame-id", "child-frame-id")
-
-
-def _command(file: str, kind: str, words: list[str]) -> _Pair:
-    """By options, or by place: x y z, then yaw pitch roll or a quaternion, both frames, and ROS 1's period."""
-    words = words[: words.index("--ros-args")] if "--ros-args" in words else words
-    if any(word.startswith("--") for word in words):
-        content = _by_options(file, words)
-    else:
-        words = [word for word in words if not word.startswith("__")]
-        by_quaternion = len(words) > 8 and not re.match(r"[A-Za-z/_]", words[6])
-        keys = ["x", "y", "z", *(_QUATERNION if by_quaternion else _ANGLES[::-1]), "frame-id", "child-frame-id"]
-        if len(words) > len(keys) + 1:
-            wrong = f"static_transform_publisher: {shown(words[len(keys) + 1])} is more than it takes"
-            raise InterchangeError(file, "", wrong, _PUBLISHED)
-        content = dict(zip(keys, words, strict=False))
-    values = FileValues(file, content, _PUBLISHED, "static_transform_publisher: ")
-    parent, child = (str(values.value(key)).lstrip("/") for key in ("frame-id", "child-frame-id"))
-    return _Pair(kind, parent, child, partial(_published_pose, values))
-
-
-def _by_options(file: str, words: Sequence[str]) -> dict[str, str]:
-    """Each once, as ``--x 0.1`` or ``--x=0.1``; its rotation as angles or as a quaternion."""
-    content: dict[str, str] = {}
-    left = iter(words)
-    for word in left:
-        name, equals, value = word.removeprefix("--").partition("=")
-        wrong = "is no option of it" if not word.startswith("--") or name not in _OPTIONS else ""
-        wrong = wrong or ("is there twice" if name in content else "")
-        content[name] = value if equals else next(left, "")
-        if wrong or not content[name]:
-            wrong = f"static_transform_publisher: {shown(word)} {wrong or 'has no value'}"
-            raise InterchangeError(file, "", wrong, _PUBLISHED)
-    both = [next((name for name in names if name in content), "") for names in (_ANGLES, _QUATERNION)]
-    if all(both):
-        wrong = f"static_transform_publisher: --{both[0]} and --{both[1]} are two rotations"
-        raise InterchangeError(file, "", wrong, "angles or a quaternion")
-    return content
-
-
-def _published_pose(values: FileValues) -> Array:
-    shift = [values.number(key, 0.0) for key in "xyz"]
-    if any(key in values.content for key in _ANGLES):
-        angles = [values.number(key, 0.0) for key in _ANGLES]
-        return make_transform(_from_angles(*angles), np.array(shift))
-    return _pose(values, shift, [values.number(key, float(key == "qw")) for key in _QUATERNION])
-
-
-def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation (3, 3) by angles (rad) about fixed x, y, z, as in URDF."""
-    x, y, z = (exp_rotation(angle * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True))
-    return z @ y @ x
-
-
-def _pose(values: FileValues, shift: Sequence[float], quaternion: Sequence[float]) -> Array:
-    length = float(np.linalg.norm(quaternion))
-    if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise values.fault("", f"its quaternion has length {length:.4g}", "a unit quaternion")
-    x, y, z, w = quaternion
-    return make_transform(rotation_from_xyzw((x, y, z, w)), np.array(shift))
+    return make_transform(from_angles(*turn), np.array(shift))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.lattice import to_bytes, to_grey
+from gripmon.calibrate.grey_levels import to_bytes, to_grey
 from gripmon.model.records import Array, Image
 from gripmon.model.targets import Charuco, TargetError
 

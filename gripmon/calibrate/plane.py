@@ -14,9 +14,10 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
-from gripmon.calibrate.bundle import Bundle, GivenCamera, independent_errors, plate_pose
+from gripmon.calibrate.bundle import Bundle, GivenCamera, independent_errors
 from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, GripperOnPlate, off_plate, stand
+from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between

@@ -69,6 +69,7 @@ class PlaneCalibration:
         rx, ry, rz = (math.degrees(value) for value in sigma[3:])
         lines.append(f"TCP in the camera frame  {x:.3f} {y:.3f} {z:.3f} mm  +- {sx:.4f} {sy:.4f} {sz:.4f} mm")
         lines.append(f"rotation about x, y, z   +- {rx:.4f} {ry:.4f} {rz:.4f} degrees")
+        lines.append("+- of noise, camera and print; without bevelled edges, and dark ones before dark print")
         if len(self.lengths_covariance):
             sides, errors = 2e3 * self.corners_m[3, :2], 1e3 * self.lengths_covariance.diagonal()[:2] ** 0.5
             apart, along = (f"{side:.3f} +- {error:.4f} mm" for side, error in zip(sides, errors, strict=True))

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.foreign import as_number, read_mapping
+from gripmon.calibrate.plate_pose import plate_pose, pose_slopes
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.csv_rows import csv_rows, read_text

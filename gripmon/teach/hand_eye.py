@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.calibrate.bundle import GivenCamera, plate_pose
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.plane import Coincidence, KnownCorners
 from gripmon.calibrate.plane import calibrate_plane as calibrate_image
 from gripmon.calibrate.plane_average import PlaneCalibration, against, average
+from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
 from gripmon.model.camera import LensSettings, make_camera

@@ -13,10 +13,10 @@ from scipy.stats import chi2, ncx2
 from benchmarks.offline_images import DISCS, OPENING_M, Setting, gripper
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.intrinsics import calibrate_single_view
 from gripmon.calibrate.plane import Coincidence, KnownCorners, calibrate_plane
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.single_view import calibrate_single_view
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
@@ -118,7 +118,7 @@ def solve(way: str, setting: Setting, image: Image, sight: Sighting, rng: np.ran
         single = calibrate_single_view(sight)
         camera = GivenCamera(single.camera, single.parameters, single.covariance)
     if way == "inferred":
-        return UnknownGripper(camera, DISCS).measure(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
+        return UnknownGripper(camera).measure(image, sight, _rough(setting, _OUTLINE, rng)).coincidence
     known = KnownGripper(camera, gripper(), OPENING_M)
     return known.measure(image, sight, _rough(setting, {name: (name, None) for name in _SEEN}, rng)).coincidence
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from gripmon.calibrate.lattice import to_bytes, to_grey
+from gripmon.calibrate.grey_levels import to_bytes, to_grey
 from gripmon.calibrate.sighting import Sighting
 from gripmon.daemon.setup.views import MOVED_PX, Coverage, View, Viewer, coverage, moved
 from gripmon.io.sources import Source, Waiting

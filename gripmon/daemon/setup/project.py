@@ -15,7 +15,7 @@ from typing import Literal
 
 import msgspec
 
-from gripmon.calibrate.lattice import to_bytes, to_grey
+from gripmon.calibrate.grey_levels import to_bytes, to_grey
 from gripmon.calibrate.target_print import print_target
 from gripmon.daemon.config import read_gripper
 from gripmon.daemon.config.calibrated import read_camera

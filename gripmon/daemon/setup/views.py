@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from gripmon.calibrate.detection import BLURRED_PX, detect
+from gripmon.calibrate.grey_levels import sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibrate.intrinsics import COVERED
-from gripmon.calibrate.lattice import sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.records import Array, Image
 from gripmon.model.targets import Target

@@ -14,7 +14,7 @@ import yaml
 
 from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
-from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
+from gripmon.calibrate.grey_levels import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
 from gripmon.daemon.config.project import FILES
 from gripmon.daemon.config.writing import with_taught
