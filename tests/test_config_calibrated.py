@@ -212,6 +212,18 @@ def test_where_the_tcp_is_may_stand_in_the_robot_s_own_file(folder: Path):
     change(folder / "arm.yaml", lambda v: v.update(reference="robot.yaml"))
     config = load_config(folder / "arm.yaml")
     np.testing.assert_allclose(config.cam_T_grip, nominal_cam_T_grip(), rtol=0.0, atol=1e-7)
+    (folder / "robot.yaml").write_text(as_yaml({"flange_T_cam": flange["flange_T_cam"]}))
+    change(
+        folder / "arm.yaml",
+        lambda v: v.update(reference={"hand_eye": "robot.yaml", "flange_T_tcp": flange["flange_T_tcp"]}),
+    )
+    np.testing.assert_allclose(
+        load_config(folder / "arm.yaml").cam_T_grip, nominal_cam_T_grip(), rtol=0.0, atol=1e-7
+    )
+    (folder / "robot.yaml").write_text(as_yaml({"flange_T_cam": flange["flange_T_cam"], "flange_frame": ""}))
+    change(folder / "arm.yaml", lambda v: v.update(reference="robot.yaml"))
+    with pytest.raises(InputError, match=r"flange_T_tcp: isn't said: where the TCP .* is in flange"):
+        load_config(folder / "arm.yaml")
     for tcp in (None, listed(np.eye(4))):  # beside one that is there, it would be said twice
         section = {"hand_eye": "robot.yaml", "flange_T_tcp": listed(np.eye(4))} if tcp else "robot.yaml"
         (folder / "robot.yaml").write_text(as_yaml({**flange, "flange_T_tcp": tcp}))

@@ -22,6 +22,9 @@ from gripmon.cli.render import columns, lines, table
         ({"pose": {"tcp_m": [0.001], "rotation_rad": [0.0]}}, ["pose  TCP 1 mm, rotation 0°"]),
         ({"notes": ["two words", None]}, ["notes", "  two words", "  -"]),
         ({"a": {"b": {"c_m": 1.0}}}, ["a", "  b  c 1000 mm"]),
+        ({"limit_m": 0.001, "limit_rad": None}, ["limit of position  1 mm", "limit of rotation  -"]),
+        ({"spot": {"px": 0.5, "m": 0.0002}}, ["spot  0.5 px, 0.2 mm"]),
+        ({"far_m": -20.951, "wide": 0.3e8}, ["far   -20951 mm", "wide  3e+07"]),
     ],
 )  # fmt: skip
 def test_a_value_has_its_unit(values: dict[str, object], shown: list[str]):

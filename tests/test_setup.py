@@ -10,6 +10,7 @@ import math
 import shutil
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from support import new_user
 from support.loopback import frame_record, free_endpoint, wait_until
+from support.sightings import CAMERAS, poses, seen
 
 from gripmon.calibrate.sighting import Sighting
 from gripmon.cli import main
@@ -35,7 +37,7 @@ from gripmon.daemon.setup.entries import other_target, target_in
 from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.site import CaptureOrder, StepRequest
 from gripmon.daemon.setup.steps import defaults, in_fields
-from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved
+from gripmon.daemon.setup.views import FEWEST_VIEWS, STILL_PX, Viewer, coverage, moved, tilts_of
 from gripmon.daemon.teaching.source import named_source
 from gripmon.io.sources import (
     FolderSettings,
@@ -580,3 +582,16 @@ def _sent(site: SetupSite, path: str, order: Any) -> Any:
     action = site.post(path)
     assert action is not None and isinstance(order, action[0])
     return action[1](order)
+
+
+def test_one_row_of_a_plate_has_no_tilt():
+    """Alone, and among views that show the whole plate: it tells nothing of their camera either."""
+    rng = np.random.default_rng(3)
+    views = seen(CAMERAS["brown_conrady"], poses(rng, 6), rng)
+    row = views[0].plate_m[:, 1] == views[0].plate_m[0, 1]
+    line = replace(views[0], uv_px=views[0].uv_px[row], plate_m=views[0].plate_m[row])
+    size_px = views[0].size_px
+    assert not tilts_of([line], size_px).any()
+    among = tilts_of([*views[:3], line], size_px)
+    assert not among[3].any() and among[:3] == pytest.approx(tilts_of(views[:3], size_px))
+    assert np.linalg.norm(among[:3], axis=1).max() > 0.05

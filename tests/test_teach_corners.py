@@ -281,6 +281,23 @@ def test_without_a_page_a_file_of_corners_does_the_same(rig: Rig, tmp_path: Path
     assert run([*command, "--force"], capsys)[0] == 0
 
 
+def test_a_configuration_with_a_robot_s_hand_eye_result_is_taught_into(rig: Rig, tmp_path: Path, capsys):
+    """Its file stands beside it, by its name."""
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    mine = tmp_path / "mine"
+    assert run(["teach", rig.image_path, "--corners", rough, *rig.options, "--out", mine], capsys)[0] == 0
+    values = yaml.safe_load((mine / "config.yaml").read_text())
+    reference = load_config(mine / "config.yaml").settings.reference
+    told = {"translation_m": list(reference.cam_T_grip.translation_m)}
+    told["rotation_xyzw"] = list(reference.cam_T_grip.rotation_xyzw)
+    (mine / "robot.yaml").write_text(yaml.safe_dump({"cam_T_grip": told}))
+    (mine / "config.yaml").write_text(yaml.safe_dump({**values, "reference": {"hand_eye": "robot.yaml"}}))
+    again: list[object] = ["teach", rig.image_path, "--config", mine / "config.yaml", "--corners", rough, "--force"]
+    code, _, err = run(again, capsys)
+    assert (code, err) == (0, "")
+    assert load_config(mine / "config.yaml").taught is not None
+
+
 def test_what_is_commented_out_is_what_holds(rig: Rig, tmp_path: Path, capsys):
     """Every # taken away, the file means the same."""
     rough = rough_file(rig, tmp_path / "rough.yaml")

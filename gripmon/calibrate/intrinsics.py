@@ -21,7 +21,7 @@ from gripmon.calibrate.bundle import DEGENERATE, Bundle, BundleProblem, Contradi
 from gripmon.calibrate.lens_models import LensModel, ModelName, lens_vector, parameter_names
 from gripmon.calibrate.plate_pose import plate_pose_start
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.calibrate.target_shape import CHANCE, TargetPoints, off_plane_m
+from gripmon.calibrate.target_shape import CHANCE, UNEVEN_TARGET, TargetPoints, off_plane_m
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.records import Array
 
@@ -53,7 +53,7 @@ def calibrate(
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
     names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
-    target, bundle = _of_uneven_target(lens_model, sightings, free, bundle, exact_target)
+    target, bundle, uneven = _of_uneven_target(lens_model, sightings, free, bundle, exact_target)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
     poses = range(len(sightings))
@@ -71,30 +71,36 @@ def calibrate(
         target=target,
         displacement_m=bundle.displacement_m,
     )
-    return replace(result, warnings=(*held, *doubts_of(result, sightings)))
+    return replace(result, warnings=(*held, *uneven, *doubts_of(result, sightings)))
 
 
 def _of_uneven_target(
     lens_model: LensModel, sightings: Sequence[Sighting], free: Array, bundle: Bundle, exact: bool | None
-) -> tuple[TargetPoints | None, Bundle]:
+) -> tuple[TargetPoints | None, Bundle, tuple[str, ...]]:
     """The fit with the displacements of the target's points as unknowns, and these points, if the residuals at each of
-    them are so alike in all images that an exact target wouldn't show it; else the fit that it is given.
+    them are so alike in all images that an exact target wouldn't show it; else the fit that it is given.  Where that
+    target's shape can't be estimated, a line that says so: an image that doesn't tell its points would hold them flat.
     """
     target = None if exact else TargetPoints.of(sightings)
     if target is None or bundle.degrees_of_freedom <= target.unknowns:
-        return None, bundle
+        return None, bundle, ()
     problem = BundleProblem(lens_model, sightings, free, target=target)
     if exact is None:
         ratio = problem.gain(bundle) / target.unknowns
         if fdtrc(target.unknowns, bundle.degrees_of_freedom, ratio) > CHANCE:
-            return None, bundle
-    found = problem.solve(bundle.parameters, bundle.cam_T_plate)
-    check_fit(lens_model, found, free)
+            return None, bundle, ()
+    whole = sum(sighting.anchored for sighting in sightings)
+    if whole < len(sightings):
+        right = f"images that all show it whole, as {whole} of these {len(sightings)} do"
+        return None, bundle, (f"{UNEVEN_TARGET}; the ± leaves that out, its shape could be estimated from {right}",)
     try:
+        found = problem.solve(bundle.parameters, bundle.cam_T_plate)
+        check_fit(lens_model, found, free)
         make_camera(lens_model.settings(found.parameters))
-    except ValueError:
-        return None, bundle
-    return target, found
+    except (CalibrationError, ValueError):
+        right = "a print on glass or metal is flat"
+        return None, bundle, (f"{UNEVEN_TARGET}, and its shape couldn't be estimated; the ± leaves that out; {right}",)
+    return target, found, ()
 
 
 def calibrate_best(
@@ -334,7 +340,7 @@ def _target(result: IntrinsicsResult) -> list[str]:
         return []
     places_m, moved_m = result.target.places_m, result.displacement_m
     off_mm = 1e3 * off_plane_m(places_m, moved_m)
-    uneven = f"the target isn't flat and exact: its points lie up to {off_mm:.2g} mm off a plane, alike in all images"
+    uneven = f"{UNEVEN_TARGET}: its points lie up to {off_mm:.2g} mm off a plane, alike in all images"
     return [f"{uneven}; their places were estimated, too, and the ± includes it; a print on glass or metal is flat"]
 
 

@@ -23,6 +23,7 @@ length: a board of 300 mm that is bent by 3 mm, and a printer that is off by 0.3
 tell: a displacement of all points together is the plate's pose, or its size.
 """
 FEWEST_VIEWS = 4
+UNEVEN_TARGET = "the target isn't flat and exact"
 CHANCE = 1e-4
 """Probability that an exact target is taken for one that isn't."""
 _SAME_M = 1e-6

@@ -6,13 +6,15 @@ A key's ending is its value's unit: ``_m`` is shown in mm, ``_rad`` in degrees.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 _UNITS = {
     "_m": (1e3, " mm"), "_rad": (math.degrees(1.0), "°"), "_px": (1.0, " px"), "_s": (1.0, " s"),
 }  # fmt: skip
 _NO_UNIT = (1.0, "")
+_OF = {"_m": "of position", "_rad": "of rotation"}
 _WORDS = {"tcp": "TCP", "rms": "RMS"}
 _NOTHING = "-"
 _LONGEST = 110
@@ -48,20 +50,28 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def named(key: str) -> str:
-    """A key in words, without its unit: ``field_of_view_rad`` is "field of view"."""
-    words = (key.removesuffix(_ending(key))).split("_")
+    """A key in words, without its unit: ``field_of_view_rad`` is "field of view", ``m`` nothing."""
+    words = f"_{key}".removesuffix(_ending(key)).removeprefix("_").split("_")
     return " ".join(_WORDS.get(word, word) for word in words)
+
+
+def _names(keys: Iterable[str]) -> dict[str, str]:
+    """Keys in words; of those whose words are the same, a length is the position's and an angle the rotation's."""
+    words = {key: named(key) for key in keys}
+    twice = {word for word, count in Counter(words.values()).items() if word and count > 1}
+    return {k: f"{word} {_OF.get(_ending(k), '')}".strip() if word in twice else word for k, word in words.items()}
 
 
 def _section(values: Mapping[str, Any], indent: str, unit: tuple[float, str]) -> list[str]:
     out: list[str] = []
     short = {key: text for key, value in values.items() if (text := _short(key, value, unit)) is not None}
-    width = max((len(named(key)) for key in short), default=0)
+    names = _names(values)
+    width = max((len(names[key]) for key in short), default=0)
     for key, value in values.items():
         if key in short:
-            out.append(f"{indent}{named(key):<{width}}  {short[key]}")
+            out.append(f"{indent}{names[key]:<{width}}  {short[key]}")
             continue
-        out.append(f"{indent}{named(key)}")
+        out.append(f"{indent}{names[key]}")
         if isinstance(value, Mapping):
             out += _section(value, f"{indent}  ", _unit(key, unit))
         else:
@@ -75,7 +85,8 @@ def _short(key: str, value: Any, outer: tuple[float, str]) -> str | None:
     unit = _unit(key, outer)
     if isinstance(value, Mapping) and value:
         inside = {each: _short(each, of, unit) for each, of in value.items() if not isinstance(of, Mapping)}
-        text = ", ".join(f"{named(each)} {of}" for each, of in inside.items())
+        names = _names(inside)
+        text = ", ".join(f"{names[each]} {of}".strip() for each, of in inside.items())
         return text if len(inside) == len(value) and None not in inside.values() and len(text) <= _LONGEST else None
     if isinstance(value, list | tuple) and any(isinstance(each, Mapping) or " " in str(each) for each in value):
         return None
@@ -86,13 +97,16 @@ def _short(key: str, value: Any, outer: tuple[float, str]) -> str | None:
 
 
 def _cell(value: Any, factor: float = 1.0) -> str:
-    """A value as text, in its shown unit by ``factor``; numbers with four digits."""
+    """A value as text, in its shown unit by ``factor``; numbers with four digits, whole ones with all."""
     if value is None or value in ("", [], (), {}):
         return _NOTHING
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
-        return str(value) if isinstance(value, int) and factor == 1.0 else f"{factor * value + 0.0:.4g}"
+        if isinstance(value, int) and factor == 1.0:
+            return str(value)
+        shown = factor * value + 0.0
+        return f"{shown:.0f}" if 1e4 <= abs(shown) < 1e7 else f"{shown:.4g}"
     if isinstance(value, str):
         return value
     return " ".join(_cell(each, factor) for each in value)
@@ -100,7 +114,7 @@ def _cell(value: Any, factor: float = 1.0) -> str:
 
 def _ending(key: str) -> str:
     """A key's unit; of a rate, such as ``frames_per_s``, it is said in words."""
-    return "" if "_per_" in key else next((ending for ending in _UNITS if key.endswith(ending)), "")
+    return "" if "_per_" in key else next((ending for ending in _UNITS if f"_{key}".endswith(ending)), "")
 
 
 def _unit(key: str, outer: tuple[float, str] = _NO_UNIT) -> tuple[float, str]:

@@ -63,7 +63,7 @@ _SHOWN, _REASONS_SHOWN = 8, 4
 _ABOUT = """\
 corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible; sigma: one frame's
 TCP at the usual opening; worst: along its least certain direction, at the worst opening; bound: on its error at the
-worst opening, compared with alert_limit_m; detects: the smallest step detected along every axis; frames: until one of
+usual opening, compared with alert_limit_m; detects: the smallest step detected along every axis; frames: until one of
 warn_m is; margin: corners to the image's border; shift: of the camera sideways until too little is in view.  Not
 included: focus, light, obstacles, and what hides the fingers without being in the gripper file."""
 _NO_FACES = """\
@@ -79,6 +79,8 @@ def _as_text(config: Config, swept: Sweep) -> list[str]:
     notes["present"] = f"{better or 'none'} of those tried {'are' if better > 1 else 'is'} better"
     if not config.gripper.faces:
         notes["no_faces"] = _NO_FACES
+    if len(present.faults) > 1:
+        notes["present_too"] = [fault.text for fault in present.faults[1:]]
     reasons = Counter(trial.faults[0].kind for trial in ranked if trial.faults).most_common(_REASONS_SHOWN)
     if reasons:
         notes["others"] = [f"{count} would not work: {kind}" for kind, count in reasons]

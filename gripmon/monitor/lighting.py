@@ -44,7 +44,7 @@ class Lighting:
 
     def kept(self, grey: Array, noise: float) -> float:
         """Which share of the light's shift in the last frame is left, by the ``grey`` levels (s, p) beside the edges
-        on their own sides, each with standard deviation ``noise``; NaN where none is seen.
+        on their own sides, NaN where none is seen, each with standard deviation ``noise``.
         """
         now = np.maximum(grey.mean(axis=1), DARKEST)
         if self._then is None:
@@ -57,7 +57,7 @@ class Lighting:
         by_noise = 2.0 * noise**2 / (grey.shape[1] * now[both] ** 2)
         square = max(float(np.median(np.square(change) - by_noise)), 0.0)  # of a few something lies in front
         before, self._kept = self._kept, math.exp(-0.5 * square / ANOTHER_LIGHT**2)
-        self._then = np.where(both, self._then, now)
+        self._then = np.where(np.isfinite(self._then), self._then, now)
         out = min(self._kept / before, 1.0)
         if square > ANOTHER_LIGHT**2:  # what follows is compared with this one
             self._then, self._kept = now, 1.0

@@ -196,8 +196,11 @@ class Kept(msgspec.Struct, frozen=True):
         """The one thing that helps most, in words."""
         if self.helps is None:
             return ""
-        with_it = "" if self.helped_m is None or self.helped_rad is None else _said(self.helped_m, self.helped_rad)
-        return f"what helps most: {self.helps}{f' (median then {with_it})' if with_it else ''}"
+        if self.helped_m is None or self.helped_rad is None:
+            return f"what helps most: {self.helps}"
+        then = f"{'then' if self.forecast else 'median then'} {_said(self.helped_m, self.helped_rad)}"
+        enough = self.helped_m <= self.alert_limit_m and self.helped_rad <= self.alert_limit_rad
+        return f"what helps most: {self.helps} ({then}{'' if enough else ', not enough'})"
 
 
 def _said(position_m: float | None, rotation_rad: float | None) -> str:

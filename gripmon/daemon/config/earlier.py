@@ -31,6 +31,7 @@ _GONE = {
 }  # fmt: skip
 """By key what to say, and what to write instead where nothing can be assumed."""
 
+
 def without_gone(path: Path, values: dict[str, Any], *, say: bool) -> dict[str, Any]:
     """The content of a configuration without the keys that are gone.
 

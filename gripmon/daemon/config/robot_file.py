@@ -59,7 +59,7 @@ def named_reference(config: Path, file: GivenFile, beside: dict[str, Any]) -> Re
     for key, value in beside.items():
         if key not in _BESIDE:
             raise ConfigError(config, f"reference.{key}", "has no place beside hand_eye", " or ".join(_BESIDE))
-        if values.get(key) is not None or (key == "flange_T_tcp" and key not in values):
+        if values.get(key) is not None or (key == "flange_T_tcp" and "cam_T_grip" in values):
             raise ConfigError(config, f"reference.{key}", f"is said by {file.path}, too", "one of both")
         if key == "flange_T_tcp":
             _transform(config, value, f"reference.{key}")
@@ -112,7 +112,7 @@ def _listed(transform: Array) -> dict[str, list[float]]:
 def frame_without_tcp(values: dict[str, Any]) -> str:
     """The frame that a robot's file is of where it doesn't say where the TCP is in it; else empty."""
     known = "cam_T_grip" in values or values.get("flange_T_tcp") is not None
-    return "" if known else str(values.get("flange_frame", "flange"))
+    return "" if known else str(values.get("flange_frame") or "flange")
 
 
 def at_flange(path: Path, values: dict[str, Any]) -> ReferenceSettings:

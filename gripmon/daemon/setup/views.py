@@ -145,14 +145,15 @@ def _wants(sightings: Sequence[Sighting], tilts: Array, size_px: tuple[int, int]
 
 
 def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
-    """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down); 0 for
-    too few points.
+    """(n, 2) rad: the plate's tilt from the image plane, towards the side that is farther away (x right, y down); 0
+    where the points span no area.
 
     An approximation for people: the camera isn't known yet.  One focal length for all views (OpenCV's start of a
     calibration: square pixels, principal point at the centre, no distortion); if fewer than three determine it, the
     image's width.
     """
-    out, seen = np.zeros((len(sightings), 2)), [s for s in sightings if len(s) >= 4]
+    out, spans = np.zeros((len(sightings), 2)), [_spans_an_area(s) for s in sightings]
+    seen = [s for s, spanning in zip(sightings, spans, strict=True) if spanning]
     centre = 0.5 * (np.array(size_px) - 1.0)
     camera = np.array([[size_px[0], 0.0, centre[0]], [0.0, size_px[0], centre[1]], [0.0, 0.0, 1.0]])
     if len(seen) >= 3:
@@ -160,7 +161,7 @@ def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
         found = cv2.initCameraMatrix2D(*zip(*points, strict=True), size_px)  # type: ignore[call-overload]
         camera = found if np.isfinite(found).all() and found[0, 0] > 0.0 else camera
     for k, sighting in enumerate(sightings):
-        if len(sighting) < 4:
+        if not spans[k]:
             continue
         _, turn, _ = cv2.solvePnP(sighting.plate_m, sighting.uv_px, camera, None, flags=cv2.SOLVEPNP_IPPE)
         normal = np.asarray(cv2.Rodrigues(turn)[0])[:, 2]
@@ -169,3 +170,10 @@ def tilts_of(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> Array:
         # Depth increases against the normal's component in the image.
         out[k] = -normal[:2] / max(across, 1e-9) * math.atan2(across, float(normal[2]))
     return out
+
+
+def _spans_an_area(sighting: Sighting) -> bool:
+    """Four points or more, not all on a line: one row of a plate has no tilt."""
+    if len(sighting) < 4:
+        return False
+    return bool(np.linalg.matrix_rank(sighting.plate_m[:, :2] - sighting.plate_m[:, :2].mean(axis=0)) == 2)

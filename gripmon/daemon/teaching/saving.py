@@ -202,9 +202,13 @@ class FileSaving:
             trial.write_text(texts["config"], encoding="utf-8")
             try:
                 values = read_yaml(trial)
-                for key in ("gripper", "camera", "reference"):
-                    if isinstance(values.get(key), str):
-                        values[key] = str((base / values[key]).resolve())
+                given = values.get("reference")
+                for section, key in (
+                    (values, "gripper"), (values, "camera"), (values, "reference"),
+                    (given if isinstance(given, dict) else {}, "hand_eye"),
+                ):  # fmt: skip
+                    if isinstance(section.get(key), str):
+                        section[key] = str((base / section[key]).resolve())
                 if "taught" in texts:
                     (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
                     values["taught"] = TAUGHT
