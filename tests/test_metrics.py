@@ -222,7 +222,7 @@ def test_a_missing_package_is_said_by_check(
 ):
     config = configured(tmp_path, "{enabled: false}", "metrics: {enabled: true}")
     assert main(["check", str(config), "--verbose"]) == 0
-    assert "metrics      http://127.0.0.1:9464/metrics\n" in capsys.readouterr().out
+    assert re.search(r"^metrics +http://127.0.0.1:9464/metrics$", capsys.readouterr().out, re.MULTILINE)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["check", str(config)]) == 2
     said = capsys.readouterr().err
