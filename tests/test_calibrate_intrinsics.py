@@ -230,11 +230,11 @@ def test_cross_validation_measures_what_the_noise_is():
     rng = np.random.default_rng(17)
     views = seen(BROWN, poses(rng, 10), rng, noise_px=0.1)
     steps: list[int] = []
-    crossed = cross_validate(views, "brown_conrady", step=lambda: steps.append(1)).rms_px
+    crossed = cross_validate(views, calibrate(views, "brown_conrady"), step=lambda: steps.append(1)).rms_px
     # A pose of its own takes 6 of a view's some hundred coordinates.
     assert crossed == pytest.approx(0.1, rel=0.08) and len(steps) == 5
     assert crossed > 0.999 * calibrate(views, "brown_conrady").rms_px
-    assert cross_validate(views[:3], "brown_conrady").rms_px is None
+    assert cross_validate(views[:3], calibrate(views[:3], "brown_conrady")).rms_px is None
 
 
 def test_what_is_fixed_stays():

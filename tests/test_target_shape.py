@@ -95,7 +95,7 @@ def test_an_exact_target_is_taken_for_one():
         views = seen(CAMERA, leaning(rng, 12), rng, noise_px=0.05, anchored=True)
         found = calibrate(views, MODEL)
         assert found.target is None and not any("flat" in warning for warning in found.warnings)
-        again = with_scatter(found, cross_validate(views, MODEL), views)
+        again = with_scatter(found, cross_validate(views, found), views)
         assert np.array_equal(again.covariance, found.covariance) and again.warnings == found.warnings
 
 
@@ -105,14 +105,14 @@ def test_where_the_images_dont_tell_which_point_is_which_the_error_is_enlarged()
         views = twisted(seed, anchored=False)
         found = calibrate(views, MODEL)
         assert found.target is None and np.abs(in_sigmas(found)).max() > 5.0
-        covered = with_scatter(found, cross_validate(views, MODEL), views)
+        covered = with_scatter(found, cross_validate(views, found), views)
         assert np.abs(in_sigmas(covered)).max() < 0.4 * np.abs(in_sigmas(found)).max()
         assert any("differ more than their errors allow" in warning for warning in covered.warnings)
 
 
 def test_views_that_had_no_part_in_the_fit_have_the_shape_that_was_found_without_them():
     views = twisted(0, anchored=True)
-    assert cross_validate(views, MODEL).rms_px == pytest.approx(0.05, rel=0.1)
+    assert cross_validate(views, calibrate(views, MODEL)).rms_px == pytest.approx(0.05, rel=0.1)
 
 
 def test_the_right_hand_side_is_the_costs_slope():

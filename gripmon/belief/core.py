@@ -233,8 +233,8 @@ class Belief:
         floor = float(candidates.log_weight[:n].max()) + math.log(self.least) - due + math.log(_OF_SIZES)
         by_policy = dict[int, float]()
         for c in np.flatnonzero(candidates.log_weight[:n] > floor) if self._table.at_ends else ():
-            h, doubts, jump = self._parent(int(c)), int(candidates.doubts[c]), self._jump_of(int(c))
-            if sees[c] or (jump >= 0 and jumps.knock[jump]) or self._is_weighed(int(c)):
+            h, doubts = self._parent(int(c)), int(candidates.doubts[c])
+            if sees[c] or self._is_knocked(int(c)) or self._is_weighed(int(c)):
                 continue
             self._just_weighed[c] = True
             for j in np.flatnonzero(jumps.knock):
@@ -258,8 +258,9 @@ class Belief:
     def _parent(self, c: int) -> int:
         return int(self._nodes.parent[self._candidates.node[c]])
 
-    def _jump_of(self, c: int) -> int:
-        return int(self._nodes.jump[self._candidates.node[c]])
+    def _is_knocked(self, c: int) -> bool:
+        jump = int(self._nodes.jump[self._candidates.node[c]])
+        return jump >= 0 and bool(self._jumps.knock[jump])
 
     def _is_weighed(self, c: int) -> bool:
         """Whether a candidate's parent saw no end either, doubted the same ends, and a knock was weighed beside it."""
@@ -330,13 +331,10 @@ class Belief:
 
     def _owed(self, chosen: Ints, log_weight: Array, sees: Flags) -> float:
         """Probability of a knock that isn't weighed beside hypotheses that see no end: they were too light for it."""
-        nodes, candidates = self._nodes, self._candidates
         weighed, owed = np.zeros(len(chosen), bool), 0.0
         for q, c in enumerate(chosen) if self._table.at_ends and not self._everything else ():
-            jump = nodes.jump[candidates.node[c]]
             if not sees[q]:
-                knocked = jump >= 0 and self._jumps.knock[jump]
-                weighed[q] = knocked or self._is_weighed(int(c)) or self._just_weighed[c]
+                weighed[q] = self._is_knocked(int(c)) or self._is_weighed(int(c)) or self._just_weighed[c]
                 owed += 0.0 if weighed[q] else math.exp(log_weight[q]) * self.priors.unseen_knock
         self._weighed = weighed
         return owed

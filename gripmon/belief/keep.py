@@ -88,16 +88,16 @@ def keep(
     candidates: Candidates, n: int, nodes: Nodes, bank: Bank, into: Bank, seen: Seen, table: Table, near: float,
     most: int, least: float, merging: bool,
 ) -> tuple[Ints, int, float]:  # fmt: skip
-    """Write g, doubts and weights of the hypotheses ``into`` another bank, the heaviest first, none lighter than
-    ``least``, by moments where two are the same (``merging``).  At most ``most`` go on: where there are more, those
-    become one that lose least by it, and what can't is listed behind them, for this frame's bound alone.  Which
-    candidate gives each its rows (k,), how many are listed, and the probability that is in none.
+    """Write g, doubts and weights of the hypotheses ``into`` another bank, none lighter than ``least``, by moments
+    where two are the same (``merging``).  At most ``most`` go on: where there are more, those become one that lose
+    least by it, and what can't is listed behind them, for this frame's bound alone.  Which candidate gives each its
+    rows (k,), how many are listed, and the probability that is in none.
     """
     order = np.argsort(-candidates.log_weight[:n])
     top, total = candidates.log_weight[order[0]], 0.0
     for c in order:
         total += math.exp(candidates.log_weight[c] - top)
-    chosen, listed, lost, full = np.empty(min(most, n), np.int64), 0, 0.0, False
+    chosen, listed, lost = np.empty(min(most, n), np.int64), 0, 0.0
     mean, covariance = np.empty(SIZE), np.empty((SIZE, SIZE))
     rest = 1.0
     for c in order:
@@ -120,9 +120,8 @@ def keep(
         if twin >= 0:
             merge(into, twin, weight, mean, covariance)
             continue
-        if merging and listed == most and not full:
+        if merging and listed == most:
             listed = make_room(into, chosen, most, table)
-            full = listed == most
         if listed == len(into.doubts):
             lost += weight
             continue
@@ -150,12 +149,13 @@ def make_room(into: Bank, chosen: Ints, n: int, table: Table) -> int:
             heavier = into.log_weight[other]
             if other == q or heavier < weight or (heavier == weight and other > q):
                 continue
+            if heavier > COMPARABLE * weight and not same_place(
+                into.mean[other], into.covariance[other], into.mean[q], into.covariance[q]
+            ):
+                continue
             loss = loss_of(into, other, q)
             loss += 0.0 if same_doubts(into.doubts[other], into.doubts[q], table) else BEGINS * weight
-            if loss < cost[q] and (
-                heavier <= COMPARABLE * weight
-                or same_place(into.mean[other], into.covariance[other], into.mean[q], into.covariance[q])
-            ):
+            if loss < cost[q]:
                 cost[q], partner[q] = loss, other
     taken, gone, left = np.zeros(n, np.bool_), np.zeros(n, np.bool_), n - max(n // 8, 1)
     count = n

@@ -228,7 +228,7 @@ def _fitted(
         else:
             result = intrinsics.calibrate(sightings, model, fixed=fixed)
             step()
-        crossed = cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
+        crossed = cross_validate(sightings, result, fixed=fixed, folds=_FOLDS, step=step)
     return with_scatter(result, crossed, sightings)
 
 

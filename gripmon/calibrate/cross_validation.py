@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from gripmon.calibrate.bundle import BundleProblem
 from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult, calibrate, doubts_of
-from gripmon.calibrate.lens_models import PINHOLE, LensModel, ModelName, lens_vector
+from gripmon.calibrate.lens_models import PINHOLE, LensModel, lens_vector
 from gripmon.calibrate.plate_pose import plate_pose_start
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.target_shape import CHANCE, FEWEST_VIEWS
@@ -20,34 +20,30 @@ from gripmon.calibrate.target_shape import CHANCE, FEWEST_VIEWS
 
 def cross_validate(
     sightings: Sequence[Sighting],
-    model: ModelName,
+    whole: IntrinsicsResult,
     *,
     fixed: Fixed = MappingProxyType({}),
     folds: int = 5,
     step: Callable[[], None] = lambda: None,
 ) -> CrossValidation:
     """Views that are left out of the calibration, a part of all at a time, with only their own pose fitted; without an
-    answer for fewer than four views.
+    answer for fewer than four views.  ``whole``: the calibration from all of them, with the same values ``fixed``.
     """
     folds = min(folds, len(sightings))
     squares, count = 0.0, 0
     cameras: list[IntrinsicsResult] = []
-    try:
-        whole = calibrate(sightings, model, fixed=fixed)
-    except CalibrationError:
-        return CrossValidation()
     if len(sightings) < 4:
         return CrossValidation()
     for fold in range(folds):
         others = [s for k, s in enumerate(sightings) if k % folds != fold]
         try:
             exact = whole.target is None
-            camera = calibrate(others, model, fixed=fixed, near=whole.camera, exact_target=exact)
+            camera = calibrate(others, whole.model, fixed=fixed, near=whole.camera, exact_target=exact)
         except CalibrationError:
             step()
             continue
         cameras.append(camera)
-        lens_model, parameters = LensModel(model, *sightings[0].size_px), lens_vector(camera.camera)
+        lens_model, parameters = LensModel(whole.model, *sightings[0].size_px), lens_vector(camera.camera)
         for sighting in camera.where_they_are(sightings)[fold::folds]:
             pose = plate_pose_start(lens_model, parameters, sighting)
             bundle = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0))).solve(parameters, [pose])

@@ -31,7 +31,7 @@ from gripmon.daemon.config.robot_file import (
     sure,
     tcp_unknown,
 )
-from gripmon.daemon.config.typed import ConfigError, SettingsError
+from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import GivenFile, kind_of, read_document, read_settings
 from gripmon.daemon.targets import target_of_command
 from gripmon.judge.statefile import unpack
@@ -169,10 +169,7 @@ def _configuration(path: Path) -> Calibrated:
 def _robot(path: Path, values: dict[str, object]) -> Calibrated:
     frame = frame_without_tcp(values)
     settings = at_flange(path, values) if frame else robot_reference(path, values)
-    try:
-        told, covariance = settings.cam_T_grip, covariance_of(settings)
-    except SettingsError as error:
-        raise InputError(f"{path}: {str(error).removeprefix('reference.')}") from None
+    told, covariance = settings.cam_T_grip, covariance_of(settings)
     return Calibrated(
         str(path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
         covariance=covariance, frame=frame, pose_notes=tuple(_uncertainty(covariance)),

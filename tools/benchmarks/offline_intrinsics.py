@@ -116,9 +116,9 @@ def on_photographs(folder: Path, board: Chequerboard) -> list[Photographs]:
     them.
     """
     images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in image_paths([folder])]
-    every = {OURS: [_ours(image, board) for image in images]}
+    ours = [_ours(image, board) for image in images]
     points: dict[str, list[tuple[Array, Array] | None]] = {
-        OURS: [(s.plate_m, s.uv_px) if s else None for s in every[OURS]],
+        OURS: [(s.plate_m, s.uv_px) if s else None for s in ours],
         **{who: [_of(find(image, board), board) for image in images] for who, find in _THEIRS.items()},
     }
     common = [k for k in range(len(images)) if all(of[k] for of in points.values())]

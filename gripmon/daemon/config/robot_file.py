@@ -116,13 +116,8 @@ def frame_without_tcp(values: dict[str, Any]) -> str:
 
 
 def at_flange(path: Path, values: dict[str, Any]) -> ReferenceSettings:
-    """The pose (4, 4) of the flange in the camera's frame.  :class:`~gripmon.model.errors.InputError`."""
-    told = _listed(invert(_transform(path, values["flange_T_cam"], "flange_T_cam")))
-    rest = {key: value for key, value in values.items() if key not in _FLANGE}
-    try:
-        return to_settings({**rest, "cam_T_grip": told}, ReferenceSettings, "")
-    except SettingsError as error:
-        raise InputError(f"{path}: {error}") from None
+    """The same as :func:`robot_reference`, of the flange.  :class:`~gripmon.model.errors.InputError`."""
+    return _checked(path, values, invert(_transform(path, values["flange_T_cam"], "flange_T_cam")))
 
 
 def tcp_unknown(path: Path, frame: str, where: str = "") -> InputError:
@@ -140,13 +135,23 @@ def robot_reference(path: Path, values: dict[str, Any], where: str = "") -> Refe
         if frame := frame_without_tcp(values):
             raise tcp_unknown(path, frame, where)
         flange_T_tcp = _transform(path, values["flange_T_tcp"], "flange_T_tcp")
-        values = {key: value for key, value in values.items() if key not in _FLANGE}
-        values["cam_T_grip"] = _listed(invert(flange_T_cam) @ flange_T_tcp)
-    elif "cam_T_grip" not in values:
+        return _checked(path, values, invert(flange_T_cam) @ flange_T_tcp, in_front=True)
+    if "cam_T_grip" not in values:
         raise InputError(f"{path}: contains no hand/eye calibration; {_RIGHT}")
+    return _checked(path, values, in_front=True)
+
+
+def _checked(
+    path: Path, values: dict[str, Any], cam_T_grip: Array | None = None, *, in_front: bool = False
+) -> ReferenceSettings:
+    """The file's section, with this pose (4, 4) in place of the flange's; ``in_front``: it is that of a gripper."""
+    if cam_T_grip is not None:
+        rest = {key: value for key, value in values.items() if key not in _FLANGE}
+        values = {**rest, "cam_T_grip": _listed(cam_T_grip)}
     try:
         settings = to_settings(values, ReferenceSettings, "")
-        reference_transform(settings)
+        if in_front:
+            reference_transform(settings)
         covariance_of(settings)
     except SettingsError as error:
         key = error.fault.key.removeprefix("reference.")
