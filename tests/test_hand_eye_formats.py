@@ -110,6 +110,8 @@ def test_a_camera_link_of_an_effector_with_x_forward_is_recognised_by_its_name_o
 
 REFUSED = [
     (EASY_1.replace("eye_on_hand: true", "eye_on_hand: false"), "robot's base to camera_color_optical_frame; is a"),
+    (EASY_1.replace("eye_on_hand: true", "eye_on_hand: 'False'"), "robot's base to camera_color_optical_frame; is a"),
+    (EASY_1.replace("eye_on_hand: true", "eye_on_hand: hardly"), "parameters.eye_on_hand: is 'hardly'; true or false"),
     (EASY_2.replace("eye_in_hand", "eye_on_base"), "is a fixed camera's pose; gripmon calibrate robot-world"),
     (MOVEIT_2.replace("EYE-IN-HAND", "EYE-TO-HAND"), "says EYE-TO-HAND; is a fixed camera's"),
     (MOVEIT_1.replace("tool0", "base_link"), "leads from base_link to camera_color_optical_frame; is a fixed"),

@@ -87,6 +87,14 @@ class FileValues:
                 raise self.fault(key, f"{shown(number)} is not a whole number", "a number of pixels")
         return int(found[0]), int(found[1])
 
+    def flag(self, key: str, otherwise: bool) -> bool:
+        """True or false, also in quotes, as some programs write it; ``otherwise`` if there is none."""
+        value = self.content.get(key, otherwise)
+        found = {"true": True, "false": False}.get(str(value).strip().lower())
+        if found is None:
+            raise self.fault(key, f"is {shown(value)}", "true or false")
+        return found
+
     def choice(self, key: str, value: Any, known: Mapping[str, Any]) -> Any:
         """The meaning of one of several names."""
         if not isinstance(value, str) or value not in known:

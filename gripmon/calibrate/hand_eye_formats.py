@@ -213,7 +213,7 @@ def _easy_handeye(values: FileValues) -> FramePair:
     """Version 1 has ``transformation`` (x … qw), ``eye_on_hand``; version 2 ``transform``, ``calibration_type``."""
     first = "transformation" in values.content
     told = values.below("parameters") if "parameters" in values.content else values
-    on_hand = told.content.get("eye_on_hand", True) if first else told.content.get("calibration_type") == "eye_in_hand"
+    on_hand = told.flag("eye_on_hand", True) if first else told.content.get("calibration_type") == "eye_in_hand"
     frames = [str(told.content.get(f"{name}_frame", name)) for name in ("robot_effector", "tracking_base")]
     if not on_hand:
         raise values.fault("", f"leads from the robot's base to {frames[1]}", FIXED)
