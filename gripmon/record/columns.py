@@ -22,8 +22,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events
+from gripmon.record.recorder import Events, Row
 
 APPLICATION_ID = "gripmon"
 _CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame

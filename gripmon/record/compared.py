@@ -16,9 +16,9 @@ from gripmon.model.records import Frame, FrameRecord, Limits
 from gripmon.record.columns import APPLICATION_ID, EventWriter, Palette, Sender, faded
 from gripmon.record.curves import CurveWriter
 from gripmon.record.layout import layout_file, layout_of_both
-from gripmon.record.pictures import Picture, Row, measured_picture
+from gripmon.record.pictures import measured_picture
 from gripmon.record.read import RecordedFrames
-from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
+from gripmon.record.recorder import Events, Picture, Recorder, Row, Scene, pack_trace
 from gripmon.record.written_file import WrittenFile, open_stream
 
 RECORDED, REPLAYED = "recorded", "replayed"
@@ -71,7 +71,7 @@ class ComparedRecorder(Recorder):
         share, limits = (None, None) if noted is None else (noted.statistic_share, noted.limits)
         packed = None if newest is None else pack_trace(newest)
         self._rows.append(Row(record, picture, packed, None, opening_m, share, limits))
-        self._rows_then.append(Row(then, None, None, None, opening_m, None, self._recorded_limits))
+        self._rows_then.append(Row(then, jaw_reported_m=opening_m, limits=self._recorded_limits))
         if len(self._rows) >= _BATCH_ROWS:
             self._write()
 

@@ -167,20 +167,39 @@ class TraceNote(msgspec.Struct, frozen=True, array_like=True):
     predicted_corners_uv_px: bytes
 
 
-class FrameNote(msgspec.Struct, frozen=True, array_like=True):
-    """A frame.  ``limits``: None if the same as those of the frame before; ``statistic_share``: see
-    :class:`gripmon.model.records.MonitorNotes`.
+class Picture(msgspec.Struct, frozen=True, array_like=True):
+    """An encoded image with its statistics (grey values 0..255)."""
+
+    blob: bytes
+    media_type: str
+    mean_grey: float
+    contrast_grey: float
+    saturated_percent: float
+    sharpness: float
+
+
+class Row(msgspec.Struct, frozen=True, array_like=True):
+    """A frame on its way into a recording: through the daemon's queue, the pipe, and the process to the files.
+
+    ``limits``: those in force, None: unknown; ``statistic_share``: see :class:`gripmon.model.records.MonitorNotes`.
+    ``due``: its image is always written, not only around an alert; ``lost``: there was no room for it; ``image``: where
+    it lies until it is a ``picture``.
     """
 
     record: FrameRecord
-    image: ImagePlace | None
-    trace: TraceNote | None
-    truth_tcp_m: tuple[float, float, float] | None
-    jaw_reported_m: float | None
-    statistic_share: float | None
-    limits: Limits | None
-    due: bool  # its image is always written, not only around an alert
-    lost: bool  # there was no room for its image
+    picture: Picture | None = None
+    trace: TraceNote | None = None
+    truth_tcp_m: tuple[float, float, float] | None = None
+    jaw_reported_m: float | None = None
+    statistic_share: float | None = None
+    limits: Limits | None = None
+    due: bool = False
+    lost: bool = False
+    image: ImagePlace | None = None
+
+    @property
+    def picture_bytes(self) -> int:
+        return 0 if self.picture is None else len(self.picture.blob)
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):
@@ -211,7 +230,7 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
 class Batch(msgspec.Struct, frozen=True, array_like=True):
     """One message over the pipe."""
 
-    frames: list[FrameNote]
+    rows: list[Row]
     events: Events
 
 

@@ -31,8 +31,7 @@ from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 from gripmon.record.columns import EventWriter, Line, Sender
 from gripmon.record.curves import CurveWriter
 from gripmon.record.overlay import OverlayWriter
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events, RecordingSettings, Scene
+from gripmon.record.recorder import Events, RecordingSettings, Row, Scene
 from gripmon.record.rig import RigWriter
 
 
