@@ -126,10 +126,19 @@ class Recorder(Output):
         """Write what is queued, finish the file and release everything, within ``timeout_s``, then by force."""
 
 
+class Then(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a run beside whose replay it is drawn, but for its frames: its limits (None: unknown), and the
+    commands that it received.
+    """
+
+    limits: Limits | None
+    commands: tuple[RecordedCommand, ...]
+
+
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
     """What the recording process is started with: everything that doesn't change while a recording runs.
 
-    ``recording_id``: an id of its own, unless one is given.
+    ``recording_id``: an id of its own, unless one is given.  ``then``: of the run that is replayed, None: it is none.
     """
 
     name: str
@@ -144,6 +153,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     version: str = __version__
     configuration: RecordedConfiguration | None = None
     view: ViewSettings | None = None  # served live, too
+    then: Then | None = None
     recording_id: str = ""
 
     def __post_init__(self) -> None:
@@ -183,7 +193,7 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
 
     ``limits``: those in force, None: unknown; ``statistic_share``: see :class:`gripmon.model.records.MonitorNotes`.
     ``due``: its image is always written, not only around an alert; ``lost``: there was no room for it; ``image``: where
-    it lies until it is a ``picture``.
+    it lies until it is a ``picture``; ``then``: what was recorded of it, if it is replayed.
     """
 
     record: FrameRecord
@@ -196,6 +206,7 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     due: bool = False
     lost: bool = False
     image: ImagePlace | None = None
+    then: FrameRecord | None = None
 
     @property
     def picture_bytes(self) -> int:

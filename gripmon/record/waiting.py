@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from gripmon.model.outputs import Notes, Trace
 from gripmon.model.records import Frame, FrameRecord, Image, State, Verdict
-from gripmon.record.recorder import RecordingSettings, Row, pack_trace
+from gripmon.record.recorder import Picture, RecordingSettings, Row, pack_trace
 
 Waiting = tuple[Row, Image | None]
 """A frame and its image, None if that isn't kept."""
+Beside = Callable[[Frame], tuple[FrameRecord, Picture | None]]
+"""Of a frame that is replayed: its record of then, and its image as it was recorded."""
 
 
 class WaitingFrames:
@@ -19,8 +22,9 @@ class WaitingFrames:
     of other frames, for which there was no room.
     """
 
-    def __init__(self, settings: RecordingSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: RecordingSettings, beside: Beside | None = None) -> None:
+        """``beside``: None if nothing is replayed; else every image is due, and written as it was recorded."""
+        self._settings, self._beside = settings, beside
         self._keeps_before = settings.around_alert_s > 0.0
         # Images kept in case of an alert leave room for those that are due.
         self.images_before = max(1, settings.queue_images - settings.queue_images // 4)
@@ -46,7 +50,9 @@ class WaitingFrames:
         if len(self._frames) >= self._settings.queue_frames:
             self._drop_oldest()
         shown = (record.state, record.verdict, record.reference_id, record.revision)
-        due = bool(self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown)
+        due = self._beside is not None or bool(
+            self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
+        )
         self.offered += 1
         self._shown = shown
         # An image that isn't due is kept in case of an alert; its trace would cost the loop more than all else here.
@@ -60,10 +66,11 @@ class WaitingFrames:
             self._image_stamp_ns = record.stamp_ns
         self.images_dropped += due and lost
         measured, noted = trace() if kept and due else None, None if notes is None else notes()
+        then, picture = (None, None) if self._beside is None else self._beside(frame)
         row = Row(
-            record, trace=None if measured is None else pack_trace(measured), jaw_reported_m=frame.jaw_opening_m,
-            statistic_share=None if noted is None else noted.statistic_share,
-            limits=None if noted is None else noted.limits, due=due, lost=lost,
+            record, picture if kept else None, None if measured is None else pack_trace(measured),
+            jaw_reported_m=frame.jaw_opening_m, statistic_share=None if noted is None else noted.statistic_share,
+            limits=None if noted is None else noted.limits, due=due, lost=lost, then=then,
         )  # fmt: skip
         self._frames.append((row, frame.image if kept else None))
 

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,6 +22,7 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Image,
+    Limits,
     RecordedConfiguration,
     ReferenceRecord,
 )
@@ -33,9 +35,13 @@ from gripmon.record.recorder import (
     RecordingSettings,
     Scene,
     Status,
+    Then,
     ViewSettings,
 )
-from gripmon.record.waiting import Waiting, WaitingFrames
+from gripmon.record.waiting import Beside, Waiting, WaitingFrames
+
+if TYPE_CHECKING:
+    from gripmon.record.read import RecordedFrames
 
 _log = logging.getLogger(__name__)
 
@@ -61,11 +67,13 @@ class ProcessRecorder(Recorder):
     are dropped and counted.  If it dies, it is started again and begins a new file.
     """
 
-    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
+    def __init__(
+        self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0, beside: Beside | None = None
+    ) -> None:
         self._scene, self._truth_tcp_m, self._patience_s = scene, truth_tcp_m, patience_s
         settings = scene.settings
         # Filled by the loop's thread, emptied by the hand-over thread.
-        self._frames = WaitingFrames(settings)
+        self._frames = WaitingFrames(settings, beside)
         self._newest_record: FrameRecord | None = None
         self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
@@ -268,7 +276,7 @@ class ProcessRecorder(Recorder):
         while len(frames) < room and (waiting := self._next_waiting(worker)) is not None:
             row, image = waiting
             place, lost = None, row.lost
-            if image is not None and self._images.takes(image):  # otherwise a refused frame, whose record says why
+            if row.picture is None and image is not None and self._images.takes(image):  # else its record says why
                 place = self._share(worker, image, row.due)
                 lost = place is None
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(row.record.seq)
@@ -284,7 +292,7 @@ class ProcessRecorder(Recorder):
         oldest = self._frames.oldest
         if oldest is not None and self._patience_s > 0.0:
             row, image = oldest
-            if image is not None and not self._slot_free(worker, row.due):
+            if row.picture is None and image is not None and not self._slot_free(worker, row.due):
                 return None
         return self._frames.take()
 
@@ -333,6 +341,8 @@ def open_recorder(
     patience_s: float = 0.0,
     configuration: RecordedConfiguration | None = None,
     view: ViewSettings | None = None,
+    replayed: RecordedFrames | None = None,
+    limits_then: Limits | None = None,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and so on, and are never overwritten.
 
@@ -341,7 +351,9 @@ def open_recorder(
     frame, whose shift from the reference is drawn beside the estimate; it is called in another thread than the loop's.
     ``patience_s``: how long ``frame`` may wait for room before it drops a frame, for input that can wait, such as a
     folder; 0 for a camera.  ``configuration`` is written into every file.  ``view``: viewers may connect and see frames
-    as they are recorded, also if recording itself is off.  Raises OSError if the directory can't be made.
+    as they are recorded, also if recording itself is off.  ``replayed``: the recorded run that the frames are read
+    from, drawn beside what is made of them now, with its limits (None: unknown).  Raises OSError if the directory can't
+    be made.
     """
     if not settings.enabled and view is None:
         return Recorder()
@@ -354,5 +366,6 @@ def open_recorder(
         name=name, directory=str(where.resolve()), settings=settings, robot=robot, camera=camera_name,
         lens=camera.settings, gripper=gripper.model, reference=reference, has_truth=truth_tcp_m is not None,
         configuration=configuration, view=view,
+        then=None if replayed is None else Then(limits=limits_then, commands=replayed.commands),
     )  # fmt: skip
-    return ProcessRecorder(scene, truth_tcp_m, patience_s)
+    return ProcessRecorder(scene, truth_tcp_m, patience_s, None if replayed is None else replayed.beside)
