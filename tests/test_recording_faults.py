@@ -34,8 +34,7 @@ from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.records import ReferenceRecord
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events
+from gripmon.record.recorder import Events, Row
 from gripmon.record.write import ProcessRecorder
 
 

@@ -29,8 +29,8 @@ from support.recorded import (
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import Moments, Pinned, Trigger, claim, is_pinned, pin_path, pinned_by
-from gripmon.record.pictures import Picture, PictureRing, Row
-from gripmon.record.recorder import RecordingSettings
+from gripmon.record.pictures import PictureRing
+from gripmon.record.recorder import Picture, RecordingSettings, Row
 from gripmon.record.write import ProcessRecorder
 
 BUMP = Alert(
@@ -52,7 +52,7 @@ def run_through(writer: ProcessRecorder, first: int, count: int, alerts: dict[in
 
     def caught_up() -> bool:
         worker = writer._worker
-        return worker is not None and not writer._waits and worker.images_sent == writer._status.images_done
+        return worker is not None and not len(writer._frames) and worker.images_sent == writer._status.images_done
 
     for i in range(first, first + count):
         writer.frame(frame(i), record(i, alerts=(alerts[i],) if i in alerts else ()), partial(trace, i))

@@ -22,8 +22,8 @@ from support.recorded import Recorded, frame, record, recorder, scene, wait_unti
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
 from gripmon.record.keeping import repair
-from gripmon.record.pictures import Row
 from gripmon.record.read import open_recordings
+from gripmon.record.recorder import Row
 
 HERE = Path(__file__).parent
 MOST_LOST_S = 2.0

@@ -35,7 +35,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_recording_that_has_no_room_leaves_what_was_there(sequence: Path, disk: Path, tmp_path: Path):
-    """A replay of images, whose recording another process writes, and of a recording, which is written in this one."""
+    """A replay of images, and of a recording, which is drawn beside it."""
     then, wanted = tmp_path / "then.rrd", disk / "wanted.rrd"
     images = (str(sequence), "--config", str(sequence / "config.yaml"))
     assert main(["replay", *images, "--out", str(tmp_path / "then.jsonl"), "--recording", str(then)]) == 0

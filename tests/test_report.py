@@ -80,6 +80,14 @@ def test_a_step_and_its_return_end_the_affected_time():
     assert "It has moved back" in recording.summary
 
 
+@pytest.mark.parametrize("kept", [slice(0, 256), slice(0, 400, 20)], ids=["cut short after it", "few frames"])
+def test_where_the_tcp_was_at_the_end_is_not_mixed_with_where_it_was_before(kept: slice):
+    """It was said to have moved back where most of the last frames were from before the motion."""
+    recording = only(Run(stepped().records[kept]))
+    assert recording.at_end.size_m == pytest.approx(3e-3, abs=1e-5)
+    assert "moved back" not in recording.summary and "displaced: when last measured" in recording.summary
+
+
 def test_a_creep_begins_where_it_left_its_noise_and_lasts_until_it_rests():
     t = np.arange(1000) / FPS
     shifts_m = np.zeros((1000, 3))

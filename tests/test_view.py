@@ -29,8 +29,7 @@ from support.network_daemon import ENVIRONMENT
 from gripmon.daemon.config import builtin_config
 from gripmon.record.files import FileSeries
 from gripmon.record.live import LiveStream
-from gripmon.record.pictures import Picture, Row
-from gripmon.record.recorder import RecordingSettings, ViewSettings
+from gripmon.record.recorder import Picture, RecordingSettings, Row, ViewSettings
 from gripmon.record.write import ProcessRecorder, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon import __version__
 from gripmon.analyse.affected import integrity_of, limits_of, motion_ranges, verdict_ranges
@@ -16,7 +17,7 @@ from gripmon.analyse.motions import change_points_of, motions_of
 from gripmon.analyse.pictures import picture_seqs
 from gripmon.analyse.running import dropped_of, running_of
 from gripmon.analyse.summary import headline, missing, paragraph
-from gripmon.analyse.track import Track, curves_of, displacement, make_track
+from gripmon.analyse.track import SECOND_NS, Track, curves_of, displacement, make_track
 from gripmon.analyse.words import count
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import ReferenceRecord
@@ -61,7 +62,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
     events = [*motions, *(alert_event(each) for each in histories if not each.is_motion), *pauses_of(track)]
     events += reference_changes(events, source.references, track)
     affected = [*motion_ranges(track, motions, limits), *verdict_ranges(track, table)]
-    last = np.flatnonzero(track.measured)[-_END_FRAMES:]
+    last = _last(track, motions)
     dropped = dropped_of(source)
     report = RecordingReport(
         robot=source.robot,
@@ -90,6 +91,16 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         faults=(*(fault for fault in source.faults if fault not in dropped), *track.faults),
     )
     return msgspec.structs.replace(report, summary=paragraph(report))
+
+
+def _last(track: Track, motions: Sequence[Event]) -> NDArray[np.intp]:
+    """The measured frames that show where the TCP was at the end: of the last second, and none from before a motion."""
+    last = np.flatnonzero(track.measured)[-_END_FRAMES:]
+    if not last.size:
+        return last
+    since_ns = max([int(track.stamp_ns[last[-1]]) - SECOND_NS, *(event.onset.stamp_ns for event in motions)])
+    shown = last[track.stamp_ns[last] >= since_ns]
+    return shown if shown.size else last
 
 
 def _numbered(events: Sequence[Event], source: Recording, track: Track) -> tuple[Event, ...]:

@@ -211,7 +211,7 @@ def protection_figure(report: RecordingReport) -> Figure:
     # Which of both is the protection level, valid_by says: the other one.
     other = "absolute" if limits.valid_by == "reference" else "since_reference"
     for row, unit, limit in ((1, "m", limits.alert_limit_m), (2, "rad", limits.alert_limit_rad)):
-        figure.axis(row, type="log")
+        figure.axis(row, type="log", nticks=4)  # of six decades no parts are named
         for name, label, colour in (
             ("protection", "protection level", PURPLE), (other, other.replace("_", " the "), PALE_PURPLE)
         ):  # fmt: skip

@@ -144,7 +144,7 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
         near = millimetres(off.size_m, off.sigma_m)
         return f"It has moved back: {measured}, the camera was where it began, to within {near}."
-    far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
+    far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad, off.rotation_sigma_rad)}"
     still = "still " if motions else ""
     text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     now = report.at_end_against_reference

@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,11 +20,8 @@ from gripmon.model.errors import InputError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.keeping import keep_whole
 from gripmon.record.read import RecordedFrames, recording_files
-from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder, Scene
+from gripmon.record.recorder import RECORDING_PATIENCE_S, Recorder
 from gripmon.record.write import open_recorder
-
-if TYPE_CHECKING:
-    from gripmon.record.compared import ComparedRecorder
 
 
 class RecordedRun:
@@ -65,36 +61,6 @@ class RecordedRun:
         recorded = self.recorded_config
         from_jpeg = recorded is not None and recorded.settings.recording.image_format == "jpeg"
         return f"{self._differences.text(from_jpeg)}{unread}"
-
-    @contextmanager
-    def compared_in(self, path: Path) -> Iterator[ComparedRecorder]:
-        """A recorder into one file that overlays the recorded run and the replay.
-
-        Raises :class:`InputError` if ``path`` can't be written, :class:`NoResultError` if writing fails later.
-        """
-        from gripmon.record.compared import ComparedRecorder  # with rerun, which a live monitor's process does without
-
-        config, reference = self.config, self.config.reference
-        if path.resolve() in {source.resolve() for source in self.source.paths}:
-            raise InputError(f"{path}: is the replayed file; another file", "recording")
-        if self.state is not None:
-            reference = self.state.references[-1]
-        part = path.with_name(f".{path.name}.part")
-        settings = config.settings
-        scene = Scene(
-            name=path.stem, directory=str(path.parent), settings=settings.recording, robot=settings.robot,
-            camera=settings.camera_name, lens=config.camera.settings, gripper=config.gripper.model, reference=reference,
-            configuration=to_recorded(config, self.state),
-        )  # fmt: skip
-        try:
-            recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
-        except OSError as error:
-            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
-        try:
-            yield recorder
-        finally:
-            recorder.close()
-            keep_whole([part], path, recorder.failure, whole=recorder.failure is None)
 
     def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
         recorded = self.source.configuration
@@ -155,8 +121,9 @@ def _limits(config: Config | None) -> Limits | None:
 
 
 @contextmanager
-def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
-    """A recorder into exactly one file, finished when the context ends; the null recorder without a path.
+def one_recording(path: Path | None, config: Config, run: RecordedRun | None = None) -> Iterator[Recorder]:
+    """A recorder into exactly one file, finished when the context ends; the null recorder without a path.  ``run``: the
+    one that is replayed, which is drawn beside its replay.
 
     Raises :class:`InputError` if the file can't be created, :class:`NoResultError` at the end if writing failed; an
     earlier file then stays.
@@ -164,6 +131,9 @@ def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
     if path is None:
         yield Recorder()
         return
+    source, state = (None, None) if run is None else (run.source, run.state)
+    if source is not None and path.resolve() in {file.resolve() for file in source.paths}:
+        raise InputError(f"{path}: is the replayed file; another file", "recording")
     # One file of any length.
     settings = msgspec.structs.replace(
         config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
@@ -179,11 +149,13 @@ def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
             camera_name=config.settings.camera_name,
             camera=config.camera,
             gripper=config.gripper,
-            reference=config.reference,
+            reference=config.reference if state is None else state.references[-1],
             directory=Path(scratch),
             name=path.stem,
             patience_s=RECORDING_PATIENCE_S,
-            configuration=to_recorded(config),
+            configuration=to_recorded(config, state),
+            replayed=source,
+            limits_then=None if run is None else _limits(run.recorded_config),
         )
         opened.enter_context(_silent_recording())
         try:

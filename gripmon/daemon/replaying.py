@@ -185,8 +185,7 @@ class FrameReplay:
     @contextmanager
     def recorded_in(self, path: Path | None) -> Iterator[None]:
         """Also record the replay (None: don't); for recorded frames together with the recorded run."""
-        both = None if self._recorded is None or path is None else self._recorded.compared_in(path)
-        with both or one_recording(path, self._config) as self._recorder:
+        with one_recording(path, self._config, self._recorded) as self._recorder:
             yield
 
     def records(self, step: Callable[[], None]) -> Iterator[FrameRecord]:

@@ -22,10 +22,11 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events
+from gripmon.record.recorder import Events, Row
 
 APPLICATION_ID = "gripmon"
+RECORDED, REPLAYED = "recorded", "replayed"
+"""What is drawn of a recorded run and of its replay, in one recording."""
 _CLOCK_TOLERANCE_NS = 86_400_000_000_000  # one day, between a frame and an event that belongs to no frame
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 

@@ -1,9 +1,8 @@
-"""A recorded run and its replay overlaid in one recording, and the corrected track of a run."""
+"""A recorded run drawn beside its replay, and the corrected track of a run."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,102 +10,41 @@ import msgspec
 import numpy as np
 import rerun as rr
 
-from gripmon.model.outputs import Event, Notes, Trace
-from gripmon.model.records import Frame, FrameRecord, Limits
-from gripmon.record.columns import APPLICATION_ID, EventWriter, Palette, Sender, faded
+from gripmon.record.columns import APPLICATION_ID, RECORDED, REPLAYED, EventWriter, Palette, Sender, faded
 from gripmon.record.curves import CurveWriter
-from gripmon.record.layout import layout_file, layout_of_both
-from gripmon.record.pictures import Picture, Row, measured_picture
-from gripmon.record.read import RecordedFrames
-from gripmon.record.recorder import Events, Recorder, Scene, pack_trace
-from gripmon.record.written_file import WrittenFile, open_stream
+from gripmon.record.recorder import Events, Row, Then
 
-RECORDED, REPLAYED = "recorded", "replayed"
-_ROOT = f"{RECORDED}/"
-_BATCH_ROWS = 32
 _LOOKS = (
     (REPLAYED, "", 255, 1.5),
-    (RECORDED, _ROOT, 110, 5.0),
+    (RECORDED, f"{RECORDED}/", 110, 5.0),
 )  # run, root of its paths, opacity, width of its lines
 
 _TRACK = "rig/corrected"
 _TRACK_ROWS_A_CHUNK = 65536
 
 
-class ComparedRecorder(Recorder):
-    """Records a replay: each frame as it is judged now, together with what ``source`` recorded about it then.
+class ThenWriter:
+    """Writes what a run recorded of the frames of its replay: the usual names, below ``recorded``."""
 
-    The replay has the usual entities; what was recorded has the same names below ``recorded``.  It writes in the
-    caller's thread, since a replay can wait.  The daemon's own alerts and state messages are not included.
-    """
-
-    failure: str | None = None
-
-    def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
-        """``recorded_limits`` are drawn beside the replay's; None: unknown.  Raises OSError if ``path`` can't be
-        written.
-        """
-        path.unlink(missing_ok=True)
-        self._source, self._recorded_limits = source, recorded_limits
-        stream, layout = open_stream(scene), layout_of_both(scene, RECORDED, REPLAYED)
-        self._file = WrittenFile(path, stream, scene, 1, layout_file(layout), contextlib.nullcontext)
-        stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
-        send = Sender(stream, _ROOT)
-        self._curves, self._status = CurveWriter(send, self._file.writer.corner_ids), EventWriter(send, RECORDED)
+    def __init__(self, stream: rr.RecordingStream, then: Then, corner_ids: tuple[str, ...]) -> None:
+        send = Sender(stream, f"{RECORDED}/")
+        self._curves, self._status = CurveWriter(send, corner_ids), EventWriter(send, RECORDED)
         _name_both(stream)
-        self._rows: list[Row] = []
-        self._rows_then: list[Row] = []
-        self._events = Events(references=[scene.reference])
-        self._commands_then = list(source.commands)
+        self._limits, self._commands = then.limits, list(then.commands)
 
-    def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """One frame with its new record; the recorded one comes from the source."""
-        then, shot = self._source.record, self._source.shot
-        assert then is not None, "every replayed frame has a record"
-        picture: Picture | None = None
-        if shot is not None and frame.image is not None:
-            picture = measured_picture(shot.blob, shot.media_type, frame.image)
-        newest, noted = trace(), None if notes is None else notes()
-        opening_m = frame.jaw_opening_m
-        share, limits = (None, None) if noted is None else (noted.statistic_share, noted.limits)
-        packed = None if newest is None else pack_trace(newest)
-        self._rows.append(Row(record, picture, packed, None, opening_m, share, limits))
-        self._rows_then.append(Row(then, None, None, None, opening_m, None, self._recorded_limits))
-        if len(self._rows) >= _BATCH_ROWS:
-            self._write()
-
-    def event(self, event: Event) -> None:
-        self._events += Events.of(event)
-
-    def close(self, timeout_s: float = 2.0) -> None:
-        self._write()
-        with self._failing():
-            if self.failure is None:
-                self._curves.finish()
-                self._file.finish()
-        with self._failing():
-            self._file.close()
-
-    def _write(self) -> None:
-        rows, then, events = self._rows, self._rows_then, self._events
-        self._rows, self._rows_then, self._events = [], [], Events()
-        if not rows or self.failure is not None:
-            return
-        self._file.writer.write(rows, events)
+    def write(self, rows: Sequence[Row]) -> None:
+        """The same frames, and the commands until then."""
+        known = [(row.then, row.jaw_reported_m) for row in rows if row.then is not None]
+        then = [Row(record, jaw_reported_m=jaw_m, limits=self._limits) for record, jaw_m in known]
         self._curves.write(then)
         newest = rows[-1].record.seq
-        commands = [command for command in self._commands_then if command.seq <= newest]
-        self._commands_then = [command for command in self._commands_then if command.seq > newest]
+        commands = [command for command in self._commands if command.seq <= newest]
+        self._commands = [command for command in self._commands if command.seq > newest]
         self._status.write(then, Events(commands=commands))
-        with self._failing():
-            self._file.flush()
 
-    @contextlib.contextmanager
-    def _failing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self.failure = self.failure or f"can't write {self._file.path}: {error.strerror or error}"
+    def finish(self) -> None:
+        """Called when nothing more is written."""
+        self._curves.finish()
 
 
 def _name_both(stream: rr.RecordingStream) -> None:

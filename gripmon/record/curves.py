@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 from gripmon.record.columns import Colour, Palette, Sender, faded
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import TraceNote, pairs
+from gripmon.record.recorder import Row, TraceNote, pairs
 from gripmon.record.table import COLUMNS, Column
 
 _LIMITS_PERIOD_NS = 2_000_000_000

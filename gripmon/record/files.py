@@ -21,13 +21,12 @@ from gripmon.record.keeping import (
     pin_path,
     space_missing,
 )
-from gripmon.record.recorder import Events, Scene
+from gripmon.record.recorder import Events, Row, Scene
 from gripmon.record.taking import FileInbox, Load
 
 if TYPE_CHECKING:
     import rerun as rr
 
-    from gripmon.record.pictures import Row
     from gripmon.record.written_file import WrittenFile
 
 _FIRST_RETRY_S = 1.0

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import rerun.blueprint as rrb
 
-from gripmon.record.columns import APPLICATION_ID, Palette
+from gripmon.record.columns import APPLICATION_ID, RECORDED, REPLAYED, Palette
 from gripmon.record.overlay import IMAGE
 from gripmon.record.recorder import Scene
 
@@ -35,6 +35,8 @@ def layout_of(scene: Scene) -> rrb.Blueprint:
     """Left: the image with its overlay, and the events.  Right: the rig in space, the TCP's drift with its limits, the
     drift test's statistic over its threshold, and the resulting states.
     """
+    if scene.then is not None:
+        return _layout_of_both(scene)
     truth = ["drift/truth_mm"] if scene.has_truth else []
     truth_named = "; wide, pale: truth" if scene.has_truth else ""
     drift = plot(
@@ -73,25 +75,24 @@ def _details(scene: Scene) -> rrb.Tabs:
     )
 
 
-def layout_of_both(scene: Scene, recorded: str, replayed: str) -> rrb.Blueprint:
+def _layout_of_both(scene: Scene) -> rrb.Blueprint:
     """Of a run and its replay; the recorded one is below its name.  Left: the image with the replay's overlay, and the
     events of both.  Right: drifts and limits of both in one plot, and the states of both.
     """
-
-    root = f"{recorded}/"
+    root = f"{RECORDED}/"
 
     def both(paths: tuple[str, str], name: str) -> rrb.TimeSeriesView:
         return plot("/", [f"{where}{path}" for where in (root, "") for path in paths], name, legend=False)
 
     drift = both(
         ("drift/limits_mm", "drift/tcp_shift_mm"),
-        f"TCP drift (mm): x red, y green, z blue, length white; wide, pale: {recorded}, thin: {replayed}",
+        f"TCP drift (mm): x red, y green, z blue, length white; wide, pale: {RECORDED}, thin: {REPLAYED}",
     )
     turn = both(("drift/delta_deg", "drift/limits_deg"), "δ (°) and its limits, of both")
     bounds = both(("protection/level_mm", "protection/limit_mm"), "Protection level (mm) and alert limit, of both")
-    states = [states_view(f"{root}status", f", {recorded}"), states_view("status", f", {replayed}")]
+    states = [states_view(f"{root}status", f", {RECORDED}"), states_view("status", f", {REPLAYED}")]
     details = rrb.Tabs(rig_view(scene), turn, bounds, active_tab=0)
-    log = log_view("/", ["events", f"{root}events"], f", {replayed} and {recorded}")
+    log = log_view("/", ["events", f"{root}events"], f", {REPLAYED} and {RECORDED}")
     judged = rrb.Vertical(drift, *states, details, row_shares=[4.5, 2, 2, 3])
     return two_columns([image_view(scene), log], [6, 3], judged)
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import FrameRecord
 from gripmon.record.columns import Palette, Sender
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import TraceNote, pairs
+from gripmon.record.recorder import Row, TraceNote, pairs
 
 IMAGE = "rig/camera/image"
 _POINT_PX, _CORNER_PX, _LINE_PX = 1.6, 3.5, 0.6

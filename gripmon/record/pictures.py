@@ -1,46 +1,15 @@
-"""Rows of a recording on their way to it: frames, with encoded images; and the images kept in case of an alert."""
+"""Encoded images, and those that are kept in case of an alert."""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import FrameRecord, Limits
 from gripmon.record.keeping import Moments
-from gripmon.record.recorder import RecordingSettings, TraceNote, to_8_bit
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An encoded image with its statistics (grey values 0..255)."""
-
-    blob: bytes
-    media_type: str
-    mean_grey: float
-    contrast_grey: float
-    saturated_percent: float
-    sharpness: float
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A frame; ``limits`` are those in force, None: unknown."""
-
-    record: FrameRecord
-    picture: Picture | None
-    trace: TraceNote | None
-    truth_tcp_m: tuple[float, float, float] | None
-    jaw_reported_m: float | None = None
-    statistic_share: float | None = None
-    limits: Limits | None = None
-
-    @property
-    def picture_bytes(self) -> int:
-        return 0 if self.picture is None else len(self.picture.blob)
+from gripmon.record.recorder import Picture, RecordingSettings, Row, to_8_bit
 
 
 def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> Picture:

@@ -21,7 +21,6 @@ import msgspec
 from gripmon.model.errors import in_short
 from gripmon.model.own_process import OwnProcess
 from gripmon.model.priority import give_way
-from gripmon.model.records import Limits
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.recorder import Scene, Status
 
@@ -62,7 +61,6 @@ class Worker:
         self.sending_from_s: float | None = None
         """Since when it doesn't take what it is sent, monotonic; None: it does."""
         self.images_sent = self.frames_sent = 0
-        self.limits_sent: Limits | None = None
         self.gone = self.still_writes = False
 
     @property

@@ -19,6 +19,7 @@ from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 from gripmon.record.container import MAGIC
 from gripmon.record.contents import Contents, LineFile, Shot, contents_of
+from gripmon.record.recorder import Picture
 from gripmon.record.recordings import Recording, decode_image
 from gripmon.record.rrd import RrdFile, UnreadableFileError
 
@@ -239,6 +240,15 @@ class RecordedFrames:
     def read(self) -> Frame | None:
         """The next frame, None after the last."""
         return next(self._given, None)
+
+    def beside(self, frame: Frame) -> tuple[FrameRecord, Picture | None]:
+        """The record of the frame that was read last, and its image as it was recorded; None if that isn't readable."""
+        from gripmon.record.pictures import measured_picture
+
+        assert self.record is not None, "every frame that was read has one"
+        if self.shot is None or frame.image is None:
+            return self.record, None
+        return self.record, measured_picture(self.shot.blob, self.shot.media_type, frame.image)
 
     def close(self) -> None:
         """Nothing more is read."""

@@ -126,10 +126,19 @@ class Recorder(Output):
         """Write what is queued, finish the file and release everything, within ``timeout_s``, then by force."""
 
 
+class Then(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a run beside whose replay it is drawn, but for its frames: its limits (None: unknown), and the
+    commands that it received.
+    """
+
+    limits: Limits | None
+    commands: tuple[RecordedCommand, ...]
+
+
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
     """What the recording process is started with: everything that doesn't change while a recording runs.
 
-    ``recording_id``: an id of its own, unless one is given.
+    ``recording_id``: an id of its own, unless one is given.  ``then``: of the run that is replayed, None: it is none.
     """
 
     name: str
@@ -144,6 +153,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     version: str = __version__
     configuration: RecordedConfiguration | None = None
     view: ViewSettings | None = None  # served live, too
+    then: Then | None = None
     recording_id: str = ""
 
     def __post_init__(self) -> None:
@@ -167,20 +177,40 @@ class TraceNote(msgspec.Struct, frozen=True, array_like=True):
     predicted_corners_uv_px: bytes
 
 
-class FrameNote(msgspec.Struct, frozen=True, array_like=True):
-    """A frame.  ``limits``: None if the same as those of the frame before; ``statistic_share``: see
-    :class:`gripmon.model.records.MonitorNotes`.
+class Picture(msgspec.Struct, frozen=True, array_like=True):
+    """An encoded image with its statistics (grey values 0..255)."""
+
+    blob: bytes
+    media_type: str
+    mean_grey: float
+    contrast_grey: float
+    saturated_percent: float
+    sharpness: float
+
+
+class Row(msgspec.Struct, frozen=True, array_like=True):
+    """A frame on its way into a recording: through the daemon's queue, the pipe, and the process to the files.
+
+    ``limits``: those in force, None: unknown; ``statistic_share``: see :class:`gripmon.model.records.MonitorNotes`.
+    ``due``: its image is always written, not only around an alert; ``lost``: there was no room for it; ``image``: where
+    it lies until it is a ``picture``; ``then``: what was recorded of it, if it is replayed.
     """
 
     record: FrameRecord
-    image: ImagePlace | None
-    trace: TraceNote | None
-    truth_tcp_m: tuple[float, float, float] | None
-    jaw_reported_m: float | None
-    statistic_share: float | None
-    limits: Limits | None
-    due: bool  # its image is always written, not only around an alert
-    lost: bool  # there was no room for its image
+    picture: Picture | None = None
+    trace: TraceNote | None = None
+    truth_tcp_m: tuple[float, float, float] | None = None
+    jaw_reported_m: float | None = None
+    statistic_share: float | None = None
+    limits: Limits | None = None
+    due: bool = False
+    lost: bool = False
+    image: ImagePlace | None = None
+    then: FrameRecord | None = None
+
+    @property
+    def picture_bytes(self) -> int:
+        return 0 if self.picture is None else len(self.picture.blob)
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):
@@ -211,7 +241,7 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
 class Batch(msgspec.Struct, frozen=True, array_like=True):
     """One message over the pipe."""
 
-    frames: list[FrameNote]
+    rows: list[Row]
     events: Events
 
 

@@ -10,8 +10,7 @@ import rerun as rr
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Transform, Verdict
 from gripmon.record.columns import Palette, Sender, pinhole, pose_columns
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Scene
+from gripmon.record.recorder import Row, Scene
 
 _IMAGE_PLANE_FRACTION = 1.35  # of the distance to the TCP: the image is a backdrop for the fingers
 _AXIS_M, _LINE_M = 0.012, 0.0004

@@ -29,10 +29,10 @@ import rerun as rr
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 from gripmon.record.columns import EventWriter, Line, Sender
+from gripmon.record.compared import ThenWriter
 from gripmon.record.curves import CurveWriter
 from gripmon.record.overlay import OverlayWriter
-from gripmon.record.pictures import Row
-from gripmon.record.recorder import Events, RecordingSettings, Scene
+from gripmon.record.recorder import Events, RecordingSettings, Row, Scene
 from gripmon.record.rig import RigWriter
 
 
@@ -43,7 +43,6 @@ class RowWriter:
         """Writes what doesn't change: the description of this file, the monitor's configuration, styles, the camera."""
         self._send = send = Sender(stream)
         gripper = Gripper(scene.gripper)
-        self.corner_ids = gripper.corner_ids
         meta = Meta(
             name=scene.name, recording_id=scene.recording_id, robot=scene.robot, camera=scene.camera,
             gripper=scene.gripper.name, version=scene.version, file_number=file_number, started_ns=time.time_ns(),
@@ -57,6 +56,7 @@ class RowWriter:
         self._curves = CurveWriter(send, gripper.corner_ids)
         self._overlay = OverlayWriter(send, gripper.corner_ids, scene.lens.height_px)
         self._rig = RigWriter(send, scene, gripper)
+        self._then = None if scene.then is None else ThenWriter(stream, scene.then, gripper.corner_ids)
         self._references: list[ReferenceRecord] = []
         self._begun = False
 
@@ -78,6 +78,8 @@ class RowWriter:
             self._overlay.write(rows)
             self._rig.write(rows)
         self._events.write(rows, events, lines)
+        if rows and self._then is not None:
+            self._then.write(rows)
 
     def write_pictures(self, rows: Sequence[Row]) -> None:
         """Send the pictures of rows that were written earlier without them."""
@@ -93,6 +95,8 @@ class RowWriter:
     def finish(self) -> None:
         """Called when nothing more is written."""
         self._curves.finish()
+        if self._then is not None:
+            self._then.finish()
 
     def _write_references(self, records: Sequence[FrameRecord]) -> list[Line]:
         references, self._references, lines = self._references, [], []

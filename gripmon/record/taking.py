@@ -12,16 +12,17 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
 import msgspec
+from msgspec.structs import replace
 
-from gripmon.model.records import Alert, AlertRecord, Limits, ReferenceRecord
+from gripmon.model.records import Alert, AlertRecord, ReferenceRecord
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.keeping import Moments, PinnedBy, Trigger, pinned_by
-from gripmon.record.pictures import PictureRing, Row, encode_picture
-from gripmon.record.recorder import Batch, Events, FrameNote, RecordingSettings, Status
+from gripmon.record.pictures import PictureRing, encode_picture
+from gripmon.record.recorder import Batch, Events, RecordingSettings, Row, Status
 
 _BEAT_PERIOD_S = 0.5  # longest time between two reports to the daemon
 _ROWS_AT_ONCE = 128
@@ -207,7 +208,6 @@ class Taker:
         self._late: list[Row] = []
         self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images for which there was no room
         self._images_lost = self._images_done = 0
-        self._limits: Limits | None = None
         self._trigger = Trigger()
         self._newest_ns: int | None = None
         self._decode = msgspec.msgpack.Decoder(Batch).decode
@@ -248,7 +248,7 @@ class Taker:
     def _take(self, batch: Batch) -> None:
         for inbox in self._inboxes:
             inbox.add_events(batch.events)
-        rows = [self._row(note) for note in batch.frames]
+        rows = [self._row(row) for row in batch.rows]
         for alert in batch.events.alerts:
             # Its own stamp may be from another clock than that of the frames.
             self._on_alert(alert, alert.seq, alert.stamp_ns, self._newest_ns)
@@ -260,25 +260,22 @@ class Taker:
             time.sleep(_SLOW_DISK_POLL_S)
             self.report()
 
-    def _row(self, note: FrameNote) -> Row:
+    def _row(self, row: Row) -> Row:
         """Around an alert every picture is written; otherwise those that are due, and the rest is kept for an alert."""
-        record, picture = note.record, None
+        record = row.record
         self._newest_ns = record.stamp_ns
         for alert in record.alerts:
             self._on_alert(alert, record.seq, record.stamp_ns, record.stamp_ns)
-        if note.image is not None:
-            picture = encode_picture(self._images.get(note.image), self._settings)
-            self._images_done += 1
-        self._limits = note.limits or self._limits
-        row = Row(
-            record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
-        )
-        if note.lost and not note.due:
+        if row.lost and not row.due:
             self._without.append(record.stamp_ns)
             self._count_lost()
-        if picture is not None and not note.due and not self._is_near(record.stamp_ns):
-            self._before.push(row)
-            row = replace(row, picture=None)
+        if row.image is None:
+            return row
+        pictured = replace(row, picture=encode_picture(self._images.get(row.image), self._settings), image=None)
+        self._images_done += 1
+        if row.due or self._is_near(record.stamp_ns):
+            return pictured
+        self._before.push(pictured)
         return row
 
     def _count_lost(self) -> None:

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from collections.abc import Callable
 
 from gripmon.model.outputs import Notes, Trace
-from gripmon.model.records import Frame, FrameRecord, Image, MeasurementTrace, MonitorNotes, State, Verdict
-from gripmon.record.recorder import RecordingSettings
+from gripmon.model.records import Frame, FrameRecord, Image, State, Verdict
+from gripmon.record.recorder import Picture, RecordingSettings, Row, pack_trace
 
-
-class Waiting(NamedTuple):
-    """A frame.  ``image``: None if it isn't kept; ``due``: it is always written, not only around an alert; ``lost``:
-    there was no room for it.
-    """
-
-    record: FrameRecord
-    image: Image | None
-    trace: MeasurementTrace | None
-    jaw_reported_m: float | None
-    notes: MonitorNotes | None
-    due: bool
-    lost: bool
+Waiting = tuple[Row, Image | None]
+"""A frame and its image, None if that isn't kept."""
+Beside = Callable[[Frame], tuple[FrameRecord, Picture | None]]
+"""Of a frame that is replayed: its record of then, and its image as it was recorded."""
 
 
 class WaitingFrames:
@@ -31,8 +22,9 @@ class WaitingFrames:
     of other frames, for which there was no room.
     """
 
-    def __init__(self, settings: RecordingSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: RecordingSettings, beside: Beside | None = None) -> None:
+        """``beside``: None if nothing is replayed; else every image is due, and written as it was recorded."""
+        self._settings, self._beside = settings, beside
         self._keeps_before = settings.around_alert_s > 0.0
         # Images kept in case of an alert leave room for those that are due.
         self.images_before = max(1, settings.queue_images - settings.queue_images // 4)
@@ -58,7 +50,9 @@ class WaitingFrames:
         if len(self._frames) >= self._settings.queue_frames:
             self._drop_oldest()
         shown = (record.state, record.verdict, record.reference_id, record.revision)
-        due = bool(self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown)
+        due = self._beside is not None or bool(
+            self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
+        )
         self.offered += 1
         self._shown = shown
         # An image that isn't due is kept in case of an alert; its trace would cost the loop more than all else here.
@@ -72,29 +66,42 @@ class WaitingFrames:
             self._image_stamp_ns = record.stamp_ns
         self.images_dropped += due and lost
         measured, noted = trace() if kept and due else None, None if notes is None else notes()
-        image = frame.image if kept else None
-        self._frames.append(Waiting(record, image, measured, frame.jaw_opening_m, noted, due, lost))
+        then, picture = (None, None) if self._beside is None else self._beside(frame)
+        row = Row(
+            record, picture if kept else None, None if measured is None else pack_trace(measured),
+            jaw_reported_m=frame.jaw_opening_m, statistic_share=None if noted is None else noted.statistic_share,
+            limits=None if noted is None else noted.limits, due=due, lost=lost, then=then,
+        )  # fmt: skip
+        self._frames.append((row, frame.image if kept else None))
 
-    def take(self) -> Waiting | None:
-        """The oldest; None if there is none."""
+    @property
+    def oldest(self) -> Waiting | None:
+        """None if there is none."""
         try:
-            oldest = self._frames.popleft()
+            return self._frames[0]
         except IndexError:
             return None
-        self._images_out += oldest.image is not None
-        return oldest
+
+    def take(self) -> Waiting | None:
+        """The oldest, which leaves; None if there is none."""
+        try:
+            row, image = self._frames.popleft()
+        except IndexError:
+            return None
+        self._images_out += image is not None
+        return row, image
 
     def clear(self) -> None:
         self._frames.clear()
 
     def _drop_oldest(self) -> None:
         try:
-            oldest = self._frames.popleft()
+            row, image = self._frames.popleft()
         except IndexError:  # the other thread took it meanwhile
             return
         self.dropped += 1
-        self._images_in -= oldest.image is not None
-        self.images_dropped -= oldest.due and oldest.lost  # no longer one of another frame
+        self._images_in -= image is not None
+        self.images_dropped -= row.due and row.lost  # no longer one of another frame
 
     def _image_is_due(self, stamp_ns: int) -> bool:
         every = self._settings.image_every

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,6 +22,7 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Image,
+    Limits,
     RecordedConfiguration,
     ReferenceRecord,
 )
@@ -29,15 +31,17 @@ from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
 from gripmon.record.process import Worker
 from gripmon.record.recorder import (
     Events,
-    FrameNote,
     Recorder,
     RecordingSettings,
     Scene,
     Status,
+    Then,
     ViewSettings,
-    pack_trace,
 )
-from gripmon.record.waiting import Waiting, WaitingFrames
+from gripmon.record.waiting import Beside, Waiting, WaitingFrames
+
+if TYPE_CHECKING:
+    from gripmon.record.read import RecordedFrames
 
 _log = logging.getLogger(__name__)
 
@@ -63,16 +67,16 @@ class ProcessRecorder(Recorder):
     are dropped and counted.  If it dies, it is started again and begins a new file.
     """
 
-    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
+    def __init__(
+        self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0, beside: Beside | None = None
+    ) -> None:
         self._scene, self._truth_tcp_m, self._patience_s = scene, truth_tcp_m, patience_s
         settings = scene.settings
         # Filled by the loop's thread, emptied by the hand-over thread.
-        self._frames = WaitingFrames(settings)
+        self._frames = WaitingFrames(settings, beside)
         self._newest_record: FrameRecord | None = None
         self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
-        self._held: Waiting | None = None  # taken from the queue; waits for a slot for its image
-        self._held_from_s = math.inf
         self._images_without_slot = self._images_lost_earlier = 0
         self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
         self._lost_earlier = self._written_earlier = 0
@@ -184,7 +188,7 @@ class ProcessRecorder(Recorder):
                 if self._closing.wait(period_s):
                     break
             self._hand_over()
-            while self._waits and self._worker is not None and time.monotonic() < self._close_before:
+            while len(self._frames) and self._worker is not None and time.monotonic() < self._close_before:
                 time.sleep(ROOM_POLL_S)
                 self._hand_over()
         except Exception as error:  # noqa: BLE001 - a failing recording must not end the monitor
@@ -192,10 +196,6 @@ class ProcessRecorder(Recorder):
             self._stopped = f"internal error: {error!r}"
             self._close_before = time.monotonic() + _STOPPED_TIMEOUT_S
         self._finish()
-
-    @property
-    def _waits(self) -> bool:
-        return len(self._frames) > 0 or self._held is not None
 
     def _hand_over(self) -> None:
         worker = self._running_worker()
@@ -274,33 +274,27 @@ class ProcessRecorder(Recorder):
         frames: list[msgspec.Raw] = []
         room = min(_BATCH_FRAMES, self._scene.settings.queue_frames - worker.frames_unwritten)
         while len(frames) < room and (waiting := self._next_waiting(worker)) is not None:
-            record, image, trace, jaw_reported_m, noted, due, lost = waiting
-            place = None
-            if image is not None and self._images.takes(image):  # otherwise a refused frame, whose record says why
-                place = self._share(worker, image, due)
+            row, image = waiting
+            place, lost = None, row.lost
+            if row.picture is None and image is not None and self._images.takes(image):  # else its record says why
+                place = self._share(worker, image, row.due)
                 lost = place is None
-            packed = None if trace is None else pack_trace(trace)
-            truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
-            limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
-            worker.limits_sent = limits or worker.limits_sent
-            share = None if noted is None else noted.statistic_share
-            whole = FrameNote(record, place, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
+            truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(row.record.seq)
+            whole = msgspec.structs.replace(row, image=place, lost=lost, truth_tcp_m=truth_tcp_m)
             frames.append(msgspec.Raw(self._encode(whole)))
-            if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
+            if row.trace is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # releases the interpreter lock: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
         return frames
 
     def _next_waiting(self, worker: Worker) -> Waiting | None:
-        """The next frame; None while there is none, or none with a slot for its image, and patience is left."""
-        if self._held is None:
-            self._held, self._held_from_s = self._frames.take(), time.monotonic()
-        waiting = self._held
-        slot = waiting is None or waiting.image is None or self._slot_free(worker, waiting.due)
-        if not slot and time.monotonic() - self._held_from_s < self._patience_s:
-            return None
-        self._held = None
-        return waiting
+        """The next frame; None while there is none, or a source that can wait does so for a slot for its image."""
+        oldest = self._frames.oldest
+        if oldest is not None and self._patience_s > 0.0:
+            row, image = oldest
+            if row.picture is None and image is not None and not self._slot_free(worker, row.due):
+                return None
+        return self._frames.take()
 
     def _slot_free(self, worker: Worker, due: bool) -> bool:
         slots = self._images.slots if due else self._frames.images_before
@@ -321,7 +315,7 @@ class ProcessRecorder(Recorder):
         if worker is not None and self._frames.offered == 0 and worker.status.path is None:
             worker.reap()  # it hasn't started yet, and there is nothing to record
         elif worker is not None:
-            self._own_failure = failure = worker.finish(self._close_before, complete=not self._waits)
+            self._own_failure = failure = worker.finish(self._close_before, complete=not len(self._frames))
             self._status = worker.status
             if worker.still_writes:
                 self._left_writing = worker.frames_unwritten
@@ -347,6 +341,8 @@ def open_recorder(
     patience_s: float = 0.0,
     configuration: RecordedConfiguration | None = None,
     view: ViewSettings | None = None,
+    replayed: RecordedFrames | None = None,
+    limits_then: Limits | None = None,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and so on, and are never overwritten.
 
@@ -355,7 +351,9 @@ def open_recorder(
     frame, whose shift from the reference is drawn beside the estimate; it is called in another thread than the loop's.
     ``patience_s``: how long ``frame`` may wait for room before it drops a frame, for input that can wait, such as a
     folder; 0 for a camera.  ``configuration`` is written into every file.  ``view``: viewers may connect and see frames
-    as they are recorded, also if recording itself is off.  Raises OSError if the directory can't be made.
+    as they are recorded, also if recording itself is off.  ``replayed``: the recorded run that the frames are read
+    from, drawn beside what is made of them now, with its limits (None: unknown).  Raises OSError if the directory can't
+    be made.
     """
     if not settings.enabled and view is None:
         return Recorder()
@@ -368,5 +366,6 @@ def open_recorder(
         name=name, directory=str(where.resolve()), settings=settings, robot=robot, camera=camera_name,
         lens=camera.settings, gripper=gripper.model, reference=reference, has_truth=truth_tcp_m is not None,
         configuration=configuration, view=view,
+        then=None if replayed is None else Then(limits=limits_then, commands=replayed.commands),
     )  # fmt: skip
-    return ProcessRecorder(scene, truth_tcp_m, patience_s)
+    return ProcessRecorder(scene, truth_tcp_m, patience_s, None if replayed is None else replayed.beside)

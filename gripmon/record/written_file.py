@@ -64,7 +64,7 @@ class WrittenFile:
         self._memory = os.memfd_create("gripmon-rrd")
         self._stream = stream
         self._stream.set_sinks(rr.FileSink(f"/proc/self/fd/{self._memory}"))
-        self._stream.send_recording_name(scene.name)
+        self._stream.send_recording_name(scene.name + (": recorded and replayed" if scene.then is not None else ""))
         self._stream.log_file_from_contents("layout.rbl", layout)
         self.writer = RowWriter(self._stream, scene, number)
 

@@ -21,8 +21,8 @@ from benchmarks import scene
 from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.files import FileSeries
-from gripmon.record.pictures import Row, encode_picture
-from gripmon.record.recorder import Events, Scene, pack_trace
+from gripmon.record.pictures import encode_picture
+from gripmon.record.recorder import Events, Row, Scene, pack_trace
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),
