@@ -296,6 +296,13 @@ def test_a_configuration_with_a_robot_s_hand_eye_result_is_taught_into(rig: Rig,
     code, _, err = run(again, capsys)
     assert (code, err) == (0, "")
     assert load_config(mine / "config.yaml").taught is not None
+    # Where no line can be added, within braces, nothing is written at all.
+    (mine / "taught.yaml").unlink()
+    (mine / "config.yaml").write_text(json.dumps({**values, "taught": None, "reference": {"hand_eye": "robot.yaml"}}))
+    before = {path.name: path.read_bytes() for path in mine.iterdir() if path.is_file()}
+    code, _, err = run(again, capsys)
+    assert code == 3 and "the configuration would be refused: " in err and "not YAML" in err
+    assert {path.name: path.read_bytes() for path in mine.iterdir() if path.is_file()} == before
 
 
 def test_what_is_commented_out_is_what_holds(rig: Rig, tmp_path: Path, capsys):
