@@ -25,8 +25,8 @@ from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
 from gripmon.model.yaml_text import yaml_value
 from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
-from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
-from gripmon.teach.session import Evaluation, Labels, TeachSession
+from gripmon.teach.messages import CornersRequest, Evaluation, Saved, SaveOrder, SavingRefused
+from gripmon.teach.session import Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtEdges, TaughtModel

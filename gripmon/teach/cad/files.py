@@ -97,7 +97,7 @@ def separate(mesh: Trimesh) -> list[Trimesh]:
     """The mesh's connected pieces, the largest first."""
     graph = mesh_library("bodies").graph
     label = graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
-    pieces = mesh.submesh([np.flatnonzero(label == one) for one in np.unique(label)], repair=False)
+    pieces: list[Trimesh] = mesh.submesh([np.flatnonzero(label == one) for one in np.unique(label)], repair=False)  # type: ignore[assignment]
     return sorted(pieces, key=lambda piece: -float(np.prod(piece.extents + 1e-6)))
 
 
