@@ -255,6 +255,8 @@ def test_a_round_finger_without_a_view_asks_for_it(tmp_path: Path, capsys: pytes
         ("a.cao", "V2\n", "doesn't begin with V1"),
         ("a.cao", "V1\n3\n0 0 0\n1 0\n", "line 4: '1 0' is not a point; 3 ordinary numbers"),
         ("a.cao", "V1\n3\n0 0 0\n.1 0 0\n0 .1 0\n0\n0\n1\n3 0 1 7\n", "line 9: "),
+        ("a.cao", "V1\n2\n0 0 0\n0 0 .1\n0\n0\n0\n1\n0 2 .01\n", "line 9: names a point that isn't there"),
+        ("a.cao", "V1\n2\n0 0 0\n0 0 .1\n1\n0 1\n", "line 6: has no faces; the surface of a finger"),
     ],
 )
 def test_files_that_cannot_be_read_are_refused_in_one_line(
@@ -358,6 +360,25 @@ def test_a_skewed_face_of_a_cao_becomes_triangles(tmp_path: Path):
     made = gripper_from_cad([path], frame="cad", **seen(cam_T_grip=nominal_cam_T_grip(150.0, (0.0, 0.0, 0.15))))
     assert len(made.gripper.edge_ids) >= 3
     assert made.gripper.points_grip_m().max() <= 0.0351
+
+
+def test_a_cylinder_of_a_cao_shows_as_that_of_a_mesh(tmp_path: Path):
+    """Round, with a disc of the same size before its end, by ViSP's words."""
+    (tmp_path / "a.cao").write_text(
+        "V1\n5\n0 0 -.04\n0 0 0\n0 0 .001\n.006 0 .001\n0 .006 .001\n0 # lines\n0\n0\n1 # cylinders\n0 1 .006\n"
+        "1 # circles\n.006 2 3 4\n"
+    )
+    rod = trimesh.creation.cylinder(6.0, segment=[[0, 0, -40], [0, 0, 0]], sections=96)
+    disc = trimesh.creation.cylinder(6.0, segment=[[0, 0, 0.999], [0, 0, 1.001]], sections=96)
+    trimesh.util.concatenate([rod, disc]).export(tmp_path / "a.stl")
+    view = seen(frame="cad", approach="+z")
+    made = gripper_from_cad([tmp_path / "a.cao"], body="all", **view).gripper
+    known = gripper_from_cad([tmp_path / "a.stl"], unit="mm", body="all", **view).gripper
+    for gripper in (made, known):  # both sides of the rod, from end to end
+        ends = gripper.points_grip_m()[gripper.edge_points]
+        along = ends[np.abs(ends[:, 0, 2] - ends[:, 1, 2]) > 0.03]
+        assert len(along) == 2
+        np.testing.assert_allclose(np.linalg.norm(along[:, :, :2], axis=2), 0.006, atol=10 * MICROMETRE)
 
 
 def test_a_finger_mesh_of_another_renderer_profile(tmp_path: Path):

@@ -30,11 +30,13 @@ from gripmon.monitor import MonitorSettings
 from gripmon.simulate import paper_rig
 from gripmon.simulate.scenario import JawScript, Sensor
 from gripmon.teach.accuracy import forecast_frame
-from gripmon.teach.corner_pose import PoseRefused, place, pose_from_corners, usual_view
+from gripmon.teach.corner_pose import PoseRefused, Snapped, place, pose_from_corners, usual_view
 from gripmon.teach.inset import unstated_inset_m
 from gripmon.teach.session import Setup
+from gripmon.teach.snapping import Snapper
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig as Viewed
+from gripmon.track.edges import Measurement
 from gripmon.track.edges.taught import gripper_digest
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
@@ -54,6 +56,14 @@ def setup(rig: Rig) -> Setup:
 
 def put(values: dict[str, list[float]]) -> dict[str, np.ndarray]:
     return {name: np.array(at) for name, at in values.items()}
+
+
+def snapped_in(
+    setup: Setup, image: np.ndarray, put_px: dict[str, np.ndarray]
+) -> tuple[Snapped, Measurement | None]:
+    settings = setup.settings
+    snapper = Snapper(setup.camera, setup.gripper, settings.corners, settings.jaw_sigma_m)
+    return snapper.snap(image, put_px, OPENING_M, setup.prior(OPENING_M), known=False)
 
 
 def test_a_few_corners_place_the_gripper_about_right():
@@ -131,10 +141,10 @@ def test_a_corner_put_by_hand_beyond_the_lens_gives_no_pose():
     camera, gripper = make_camera(WIDE_LENS), sharp_gripper()
     points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points] @ pose[:3, :3].T + pose[:3, 3]
     shown = dict(zip(gripper.corner_ids, camera.project(points_m), strict=True))
-    found = Setup(camera, gripper, MonitorSettings(), None).evaluate(image, shown, (), OPENING_M)
-    assert found.reference is not None
+    setup = Setup(camera, gripper, MonitorSettings(), None)
+    assert setup.evaluate(image, shown, (), OPENING_M).reference is not None
     with pytest.raises(PoseRefused, match="L_in_near was placed outside the lens's view"):
-        pose_from_corners(camera, gripper, found.snapped, {"L_in_near": np.array([1.0, 1.0])})
+        pose_from_corners(camera, gripper, *snapped_in(setup, image, shown), {"L_in_near": np.array([1.0, 1.0])})
 
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="../shared/data/visp_cube is not there")
@@ -234,7 +244,7 @@ def test_corners_by_hand_count_little_against_measured_ones(rig: Rig, setup: Set
     rough = put(rig.rough(*INNER))
     found = setup.evaluate(rig.image, rough, (), OPENING_M)
     held = {"R_in_near": rig.corners_px["R_in_near"] + 0.5}
-    by_hand = pose_from_corners(rig.camera, rig.gripper, found.snapped, held)
+    by_hand = pose_from_corners(rig.camera, rig.gripper, *snapped_in(setup, rig.image, rough), held)
     assert found.pose is not None and set(by_hand.corners) == set(found.pose.corners)
     assert by_hand.covariance[0, 0] > 1.2 * found.pose.covariance[0, 0]
     moved = perturbation_between(found.pose.cam_T_grip, by_hand.cam_T_grip)
@@ -296,6 +306,13 @@ def test_a_configuration_with_a_robot_s_hand_eye_result_is_taught_into(rig: Rig,
     code, _, err = run(again, capsys)
     assert (code, err) == (0, "")
     assert load_config(mine / "config.yaml").taught is not None
+    # Where no line can be added, within braces, nothing is written at all.
+    (mine / "taught.yaml").unlink()
+    (mine / "config.yaml").write_text(json.dumps({**values, "taught": None, "reference": {"hand_eye": "robot.yaml"}}))
+    before = {path.name: path.read_bytes() for path in mine.iterdir() if path.is_file()}
+    code, _, err = run(again, capsys)
+    assert code == 3 and "the configuration would be refused: " in err and "not YAML" in err
+    assert {path.name: path.read_bytes() for path in mine.iterdir() if path.is_file()} == before
 
 
 def test_what_is_commented_out_is_what_holds(rig: Rig, tmp_path: Path, capsys):

@@ -11,6 +11,7 @@ import time
 import urllib.parse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +24,10 @@ from gripmon.io.sources import Waiting
 from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture
-from gripmon.teach.messages import BadRequest, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page_server import OutlineSession, PageServer, TeachSite
-from gripmon.teach.session import Evaluation, Labels, Setup, TeachSession
+from gripmon.teach.messages import BadRequest, Evaluation, Saved, SaveOrder, SavingRefused
+from gripmon.teach.page_server import PageServer
+from gripmon.teach.session import Labels, Setup, TeachSession
+from gripmon.teach.sites import OutlineSite, TeachSite
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
 DEADLINE_S = 30.0
@@ -90,7 +92,7 @@ def ask(
         connection.close()
 
 
-def look(server: PageServer, value: object) -> tuple[int, dict[str, object]]:
+def look(server: PageServer, value: object) -> tuple[int, dict[str, Any]]:
     status, _, data = ask(server, "look", "POST", json.dumps(value).encode())
     return status, json.loads(data)
 
@@ -98,7 +100,7 @@ def look(server: PageServer, value: object) -> tuple[int, dict[str, object]]:
 def test_every_file_of_the_page_is_served_and_allows_nobody_else(served: PageServer):
     status, headers, page = ask(served)
     assert status == 200 and headers["Content-Type"].startswith("text/html")
-    for name in ("style.css", "main.js", "stage.js", "panel.js", "history.js", "server.js", "icon.svg", "state"):
+    for name in ("style.css", "main.js", "stage.js", "panel.js", "history.js", "page.js", "icon.svg", "state"):
         status, headers, data = ask(served, name)
         assert status == 200 and data, name
         assert "script-src 'self'" in headers["Content-Security-Policy"]
@@ -199,17 +201,18 @@ def test_wherever_corners_are_put_there_is_an_answer(
 ):
     status, reply = look(served, {"corners": corners, "by_hand": list(corners) if by_hand else [], "image": 0})
     assert status == 200, reply
-    assert reply["refused"] or reply["share"] > 0.3
-    assert len(reply["corners"]) == 8
-    if reply["refused"]:
-        assert not reply["expected"] and all(corner["uv_px"] is None for corner in reply["corners"])
+    seen = reply["snapped"]
+    assert seen["refused"] or seen["share"] > 0.3
+    assert len(seen["corners"]) == 8
+    if seen["refused"]:
+        assert not reply["expected"] and all(corner["uv_px"] is None for corner in seen["corners"])
 
 
 def test_pages_don_t_disturb_each_other(served: PageServer, rig: Rig):
     """Each answer is of its own corners, whoever else asks at the same time."""
     good = rig.rough("L_in_near", "L_in_far", "R_in_near", "R_in_far")
     few = {"L_in_near": good["L_in_near"]}
-    answers: dict[int, tuple[int, dict[str, object]]] = {}
+    answers: dict[int, tuple[int, dict[str, Any]]] = {}
 
     def visit(number: int) -> None:
         corners = few if number % 2 else good
@@ -223,9 +226,10 @@ def test_pages_don_t_disturb_each_other(served: PageServer, rig: Rig):
     assert sorted(answers) == list(range(6))
     for number, (status, reply) in answers.items():
         assert status == 200
-        assert (reply["refused"] is not None) == bool(number % 2)
+        seen = reply["snapped"]
+        assert (seen["refused"] is not None) == bool(number % 2)
         if not number % 2:
-            found = {corner["name"]: corner["uv_px"] for corner in reply["corners"]}  # type: ignore[attr-defined]
+            found = {corner["name"]: corner["uv_px"] for corner in seen["corners"]}
             assert np.linalg.norm(np.array(found["L_in_near"]) - rig.corners_px["L_in_near"]) < 0.2
 
 
@@ -314,8 +318,9 @@ def test_images_of_more_bits_are_shown_as_pictures(rig: Rig, saving: Told):
 def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_path: Path):
     image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
     path = tmp_path / "rough.yaml"
-    session = OutlineSession(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
-    server = PageServer(TeachSite(session))
+    server = PageServer(
+        OutlineSite(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
+    )
     names = [
         f"{finger}_{point}_{side}"
         for finger in ("left", "right")
@@ -334,8 +339,8 @@ def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_pat
         assert state["corners_only"] and (state["width_px"], state["height_px"]) == (64, 48)
         assert set(names) < set(state["corners"]) == set(state["places"])
         assert all(0 < u < 64 and 0 < v < 48 for u, v in state["places"].values())
-        assert ask(server, "image/0.png")[2].startswith(b"\x89PNG") and ask(server, "image/1.png")[0] == 400
-        assert look(server, {"corners": put})[0] == ask(server, "live.jpg")[0] == 400
+        assert ask(server, "image/0.png")[2].startswith(b"\x89PNG") and ask(server, "image/1.png")[0] == 404
+        assert look(server, {"corners": put})[0] == ask(server, "live.jpg")[0] == 404
         for corners, why in (
             ({}, "corners.left_inner_near: is missing"),
             ({n: at for n, at in put.items() if "inner" in n}, "only one edge of its own is given"),

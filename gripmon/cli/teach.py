@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
     from gripmon.teach.api import Teaching
     from gripmon.teach.measure import Taught
     from gripmon.teach.messages import Saved
-    from gripmon.teach.page_server import OutlineSession
-    from gripmon.teach.session import TeachSession
+    from gripmon.teach.page_server import Site
     from gripmon.track.edges.taught import TaughtEdge
 
 _OPTIONS = f"""
@@ -190,7 +190,8 @@ def _teach_by_hand(arguments: Arguments) -> None:
     arguments.image = image_paths(arguments.image)
     if wrong := _misuse(arguments):
         raise InputError(f"teach: {wrong}")
-    from gripmon.daemon.teaching import in_words, outline_session, page_session, read_inputs, teach_from_file
+    from gripmon.daemon.teaching import in_words, outline_page, page_session, read_inputs, teach_from_file
+    from gripmon.teach.sites import TeachSite
 
     images = arguments.image
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
@@ -198,13 +199,13 @@ def _teach_by_hand(arguments: Arguments) -> None:
             right = "one image, to mark rough corners in, or --gripper FILE"
             raise InputError(f"teach: {len(images)} images, and no gripper; {right}")
         folder = arguments.out or Path()
-        session = outline_session(images[0], arguments.camera, folder)
+        page = outline_page(images[0], arguments.camera, folder)
         make_directory(folder)
         try:
-            _serve(arguments, session)
+            _serve(arguments, page)
         finally:
-            if session.saved is not None:
-                _say(session.saved)
+            if page.saved is not None:
+                _say(page.saved)
         return
     files = {name: getattr(arguments, name) for name in ("out", "config", "camera", "gripper", "reference")}
     inputs = read_inputs(
@@ -216,7 +217,17 @@ def _teach_by_hand(arguments: Arguments) -> None:
     make_directory(inputs.folder)
     arguments.check_outputs("picture")
     if arguments.page:
-        _serve(arguments, page_session(inputs))
+        session = page_session(inputs)
+
+        def look() -> None:
+            dark_s, why = session.dark()
+            if arguments.live_wait is not None and dark_s > arguments.live_wait:
+                raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
+
+        try:
+            _serve(arguments, TeachSite(session), look)
+        finally:
+            session.close()
         return
     found, save = teach_from_file(inputs, arguments.corners)
     print("\n".join(in_words(found)))
@@ -261,17 +272,8 @@ def _say(saved: Saved) -> None:
     print("\n".join(lines), flush=True)
 
 
-def _serve(arguments: Arguments, session: TeachSession | OutlineSession) -> None:
+def _serve(arguments: Arguments, site: Site, look: Callable[[], object] = lambda: None) -> None:
     """Serve the page until the person is done."""
-    from gripmon.teach.page_server import TeachSite, serve
+    from gripmon.teach.page_server import serve
 
-    def look() -> None:
-        dark_s, why = session.dark()
-        if arguments.live_wait is not None and dark_s > arguments.live_wait:
-            raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
-
-    try:
-        announce, browser = announcer("teach"), not arguments.no_browser
-        serve(TeachSite(session), arguments.port, announce, open_browser=browser, look=look)
-    finally:
-        session.close()
+    serve(site, arguments.port, announcer("teach"), open_browser=not arguments.no_browser, look=look)

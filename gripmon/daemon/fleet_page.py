@@ -101,7 +101,7 @@ class FleetSite:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._files = web_files("fleet.html", "style.css", "fleet.css", "icon.svg", "fleet.js", "mount.js", "server.js")
+        self._files = web_files("fleet.html")
         self._pictures: dict[tuple[MonitorName, str, bool], tuple[float, Picture | str]] = {}
         self._under_way: dict[tuple[MonitorName, str, bool], threading.Lock] = {}
         self._lock = threading.Lock()  # guards both

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,15 +35,14 @@ _LARGEST_PX = 100_000.0  # of a coordinate: corners may be set in the image, or 
 _STEP = 0.3  # of a standard deviation, for central differences
 
 
-@dataclass(frozen=True, slots=True)
-class SnappedCorner:
-    """One corner: ``model_px`` (2,) where the pose projects it, NaN beyond the lens; ``uv_px`` (2,) where its edges
+class SnappedCorner(msgspec.Struct, frozen=True):
+    """One corner: ``model_px`` (2,) where the pose projects it, None beyond the lens; ``uv_px`` (2,) where its edges
     meet, with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused for the
     ``reason``; ``inliers``: part of the search lines on its edges that agree, None without any.
     """
 
     name: str
-    model_px: Array
+    model_px: Array | None
     uv_px: Array | None
     covariance_px: Array | None
     sigma_px: float | None
@@ -50,9 +50,8 @@ class SnappedCorner:
     reason: str | None
 
 
-@dataclass(frozen=True, slots=True)
-class Snapped:
-    """What the image shows near corners set by hand.
+class Snapped(msgspec.Struct, frozen=True, kw_only=True):
+    """What the image shows near corners set by hand; the page gets it as it is.
 
     ``refused``: why nothing was found, as a text; then ``cam_T_grip`` (4, 4) is the rough pose, otherwise the measured
     one.  ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2), the
@@ -66,9 +65,8 @@ class Snapped:
     edge_points_px: Array
     share: float
     jaw_opening_m: float | None
-    jaw_sigma_m: float | None
-    refused: str | None
-    measurement: Measurement | None
+    jaw_sigma_m: float | None = None
+    refused: str | None = None
 
 
 class PoseRefused(ValueError):
@@ -93,14 +91,14 @@ def pose_from_corners(
     camera: Camera,
     gripper: Gripper,
     snapped: Snapped,
+    found: Measurement | None,
     by_hand_px: Mapping[str, Array],
     camera_error: GivenCamera | None = None,
     exact: bool = False,
 ) -> CornerPose:
-    """Pose of the gripper from corners that were measured or set by hand; ``exact``: its edges are as sharp as the file
-    says.  Raises :class:`PoseRefused`.
+    """Pose of the gripper from corners that were measured (``found``) or set by hand; ``exact``: its edges are as sharp
+    as the file says.  Raises :class:`PoseRefused`.
     """
-    found = snapped.measurement
     if found is None:
         raise PoseRefused(f"no pose: {snapped.refused}")
     measured = [i for i, c in enumerate(snapped.corners) if c.uv_px is not None and c.name not in by_hand_px]
@@ -116,7 +114,7 @@ def pose_from_corners(
     by_edges = refusal(gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]) is not None
     if by_edges:
         # Take all corners where the edges' joint fit has them; their covariance is that of the measurement.
-        every = [i for i, c in enumerate(snapped.corners) if np.isfinite(c.model_px).all()]
+        every = [i for i, c in enumerate(snapped.corners) if c.model_px is not None]
         uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
         joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
     inset_m = 0.0 if exact else unstated_inset_m(gripper)
@@ -133,7 +131,7 @@ def pose_from_corners(
             perturbation_between(solve(*low).cam_T_grip, solve(*high).cam_T_grip) / (2.0 * _STEP)
             for low, high in [
                 *_error_sources(camera, gripper, snapped, camera_error),
-                *_bevels(camera, gripper, snapped, 0.0 if by_edges else inset_m),
+                *_bevels(camera, gripper, found, snapped.jaw_opening_m, 0.0 if by_edges else inset_m),
             ]
         ]
         if by_edges and inset_m:
@@ -193,10 +191,11 @@ def _error_sources(
     return sources
 
 
-def _bevels(camera: Camera, gripper: Gripper, snapped: Snapped, inset_m: float) -> list[tuple[_Seen, _Seen]]:
+def _bevels(
+    camera: Camera, gripper: Gripper, found: Measurement, opening_m: float | None, inset_m: float
+) -> list[tuple[_Seen, _Seen]]:
     """The same for bevels: the corners that show aren't the model's, and an opening measured with them is off, too."""
-    found, opening_m = snapped.measurement, snapped.jaw_opening_m
-    if found is None or not inset_m:
+    if not inset_m:
         return []
     moved_px = _STEP * inset_corners_px(camera, gripper, found, inset_m)
     step_m = 0.0

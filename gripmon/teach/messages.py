@@ -12,8 +12,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from gripmon.model.records import Image
+from gripmon.model.records import Image, ReferenceRecord
 from gripmon.teach.accuracy import Accuracy
+from gripmon.teach.corner_pose import CornerPose, Snapped
 
 Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
 Place = tuple[Pixel, Pixel]
@@ -69,8 +70,9 @@ class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the page starts with.  ``corners_only``: there is no gripper, nothing snaps; ``saves``: what can be saved;
-    ``back``: where the page goes when the person is done.
+    """What the page starts with.  ``places``: where corners first show; ``needed``: how many of them must be set;
+    ``corners_only``: there is no gripper, nothing snaps; ``saves``: what can be saved; ``back``: where the page goes
+    when the person is done.
     """
 
     width_px: int
@@ -78,32 +80,20 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     corners: tuple[str, ...]
     places: dict[str, Place | None]
     pictures: tuple[PictureInfo, ...]
-    live: str | None
-    has_jaw: bool
-    jaw_m: tuple[float, float, float]
     gripper: str
-    reference: str | None
     needed: int
-    robot: str
-    camera_name: str
-    fixed_names: bool
     folder: str
     files: dict[str, str]
+    live: str | None = None
+    has_jaw: bool = False
+    jaw_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    reference: str | None = None
+    robot: str = ""
+    camera_name: str = ""
+    fixed_names: bool = True
     corners_only: bool = False
     saves: tuple[str, ...] = ("config", "taught", "corners")
     back: str | None = None
-
-
-class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``model_px``: where the pose projects it; the rest as in :class:`gripmon.teach.snapping.SnappedCorner`."""
-
-    name: str
-    model_px: Place | None
-    uv_px: Place | None
-    covariance_px2: tuple[float, float, float] | None
-    sigma_px: float | None
-    inliers: float | None
-    reason: str | None
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,28 +106,17 @@ class Expectation(msgspec.Struct, frozen=True, kw_only=True):
     reachable: bool
 
 
-class ReferenceReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``id`` with standard deviations (6,)."""
+class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that follows from corners set by hand in one image: the resulting (or known) ``reference``, None with
+    the reason as a text; ``pose``: what it results from; ``expected`` None where too few edges are in view to measure
+    anything.
+    """
 
-    id: str
-    sigma: tuple[float, ...]
-    corners: int | None
-    rival: bool
-
-
-class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """What follows from corners set by hand."""
-
-    corners: tuple[CornerReply, ...]
-    outlines_px: dict[str, tuple[Place, ...]]
-    edge_points_px: tuple[Place, ...]
-    share: float
-    refused: str | None
-    jaw_opening_m: float | None
-    jaw_sigma_m: float | None
-    reference: ReferenceReply | None
-    no_reference: str | None
-    expected: Expectation | None
+    snapped: Snapped
+    pose: CornerPose | None = None
+    reference: ReferenceRecord | None = None
+    no_reference: str | None = None
+    expected: Expectation | None = None
 
 
 class Saved(msgspec.Struct, frozen=True, kw_only=True):

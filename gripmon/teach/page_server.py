@@ -19,7 +19,7 @@ import secrets
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -27,28 +27,11 @@ from socketserver import TCPServer
 from typing import Any, Protocol, TypeVar
 
 import msgspec
+import numpy as np
 
-from gripmon import __version__
-from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.atomic import write_atomically
 from gripmon.model.decoding import decoder_of
 from gripmon.model.errors import InputError, in_short
-from gripmon.teach.api import Picture
-from gripmon.teach.messages import (
-    BadRequest,
-    CornersRequest,
-    EmptyRequest,
-    Failure,
-    PictureInfo,
-    Place,
-    Reply,
-    Saved,
-    SaveOrder,
-    State,
-    encoded,
-)
-from gripmon.teach.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
-from gripmon.teach.session import TeachSession
+from gripmon.teach.messages import BadRequest, EmptyRequest, Failure
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -95,13 +78,11 @@ class Site(Protocol):
         ...
 
 
-def web_files(first: str, *names: str) -> dict[str, Served]:
-    """Files of the folder ``web`` by the path at which they are served; ``first`` at the root."""
+def web_files(page: str) -> dict[str, Served]:
+    """The folder ``web`` by the path at which its files are served: ``page`` at the root, and what pages consist of."""
     folder = importlib.resources.files("gripmon.teach") / "web"
-    return {
-        "" if name == first else name: ((folder / name).read_bytes(), _KINDS[Path(name).suffix])
-        for name in (first, *names)
-    }
+    files = {file.name: (file.read_bytes(), _KINDS[Path(file.name).suffix]) for file in folder.iterdir()}
+    return {"": files[page]} | {name: file for name, file in files.items() if not name.endswith(".html")}
 
 
 class PageServer:
@@ -163,7 +144,7 @@ class _Http(ThreadingHTTPServer):
     def __init__(self, site: Site, port: int, address: str):
         self.site, self.done = site, threading.Event()
         self.token = secrets.token_urlsafe(_TOKEN_BYTES)
-        self.encode = msgspec.json.Encoder().encode
+        self.encode = msgspec.json.Encoder(enc_hook=np.ndarray.tolist).encode
         super().__init__((address, port), _Handler)
         names = {address, "localhost"} if address == ADDRESS else {address}
         self.hosts = frozenset(f"{name}:{self.server_port}" for name in names)
@@ -281,141 +262,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing: every address contains the token."""
-
-
-class TeachSite:
-    """The teaching page for one session.  ``back``: where the page goes when the person is done, None for nowhere;
-    ``saves``: which files it offers, None for all.
-    """
-
-    def __init__(
-        self, session: TeachSession | OutlineSession, back: str | None = None, saves: tuple[str, ...] | None = None
-    ):
-        self._session, self._back, self._saves = session, back, saves
-        self._files = web_files(
-            "index.html", "style.css", "icon.svg", "main.js", "stage.js", "panel.js", "history.js", "server.js"
-        )
-
-    def get(self, path: str) -> Served | None:
-        if path in self._files:
-            return self._files[path]
-        if path == "state":
-            state = self._session.state()
-            state = msgspec.structs.replace(state, back=self._back, saves=self._saves or state.saves)
-            return msgspec.json.encode(state), "application/json"
-        if path.partition("?")[0] == "live.jpg":
-            return self._session.live(), "image/jpeg"
-        number = path.removeprefix("image/").removesuffix(".png")
-        if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
-            return self._session.still(int(number)), "image/png"
-        return None
-
-    def post(self, path: str) -> Action | None:
-        session = self._session
-        actions: dict[str, Action] = {
-            "look": (CornersRequest, session.look),
-            "take": (EmptyRequest, lambda _: session.take()),
-            "save": (SaveOrder, session.save),
-        }
-        return actions.get(path)
-
-
-_NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)
-_COLUMNS = {"left": 0.06, "right": 0.8}
-
-
-class OutlineSession:
-    """Like :class:`gripmon.teach.session.TeachSession`, without a gripper: one image, whose corners go to ``path``.
-
-    ``follows``: the command that reads that file; ``note``: a remark on it; ``saved``: what was last written, None
-    before.
-    """
-
-    def __init__(self, picture: Picture, path: Path, follows: str, note: str):
-        self._picture, self._path, self._follows, self._note = picture, path, follows, note
-        self._lock = threading.Lock()
-        self.saved: Saved | None = None
-
-    def close(self) -> None:
-        """Nothing to release."""
-
-    def dark(self) -> tuple[float, str]:
-        """Always 0: there is no camera."""
-        return 0.0, ""
-
-    def state(self) -> State:
-        height_px, width_px = self._picture.image.shape[:2]
-        return State(
-            width_px=width_px,
-            height_px=height_px,
-            corners=_NAMES,
-            places=_columns(width_px, height_px),
-            pictures=(PictureInfo(number=0, name=self._picture.name, jaw_opening_m=None),),
-            live=None,
-            has_jaw=False,
-            jaw_m=(0.0, 0.0, 0.0),
-            gripper="no gripper file yet",
-            reference=None,
-            needed=2 * len(INNERMOST),
-            robot="robot",  # the page neither asks for these names nor writes them
-            camera_name="camera",
-            fixed_names=True,
-            folder=str(self._path.parent.resolve()),
-            files={"corners": str(self._path), "config": "", "taught": ""},
-            corners_only=True,
-        )
-
-    def look(self, put: CornersRequest) -> Reply:
-        """Always :class:`BadRequest`."""
-        raise BadRequest("corners don't snap without a gripper file; they are placed and saved")
-
-    def take(self) -> tuple[PictureInfo, ...]:
-        """Always :class:`BadRequest`."""
-        raise BadRequest("there is no live camera here")
-
-    def live(self) -> bytes:
-        """Always :class:`BadRequest`."""
-        raise BadRequest("there is no live camera here")
-
-    def still(self, number: int) -> bytes:
-        """The image as PNG.  Raises :class:`BadRequest`."""
-        if number != 0:
-            raise BadRequest(f"there is no image {number}; 1 is there")
-        return encoded(self._picture.image, ".png")
-
-    def save(self, order: SaveOrder) -> Saved:
-        """Write the corners if ``calibrate plane --infer`` can use them; otherwise return the reason."""
-        corners = order.put.corners
-        try:
-            outlines_of(corners)
-        except CalibrationError as error:
-            return Saved(refused=str(error))
-        with self._lock:
-            if self._path.exists() and not order.replace:
-                return Saved(exists=(str(self._path),))
-            try:
-                write_atomically(self._path, self._text(corners).encode())
-            except OSError as error:
-                return Saved(refused=f"{self._path}: can't be written ({error.strerror or error})")
-            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(self._note,), next=self._follows)
-            return self.saved
-
-    def _text(self, corners: Mapping[str, Place]) -> str:
-        image = " ".join(ascii(self._picture.name)[1:-1].split())
-        lines = [
-            f"# Rough fingertip corners in {image}, put by hand (gripmon teach --page, gripmon {__version__})",
-            "# For gripmon calibrate plane --infer --corners; name: [column, row] in the image (px)",
-            "corners:",
-        ]
-        lines += [f"  {name}: [{corners[name][0]:.2f}, {corners[name][1]:.2f}]" for name in _NAMES if name in corners]
-        return "\n".join(lines) + "\n"
-
-
-def _columns(width_px: int, height_px: int) -> dict[str, Place | None]:
-    """First positions of the handles: a column for each finger, in the order of its outline."""
-    order = [f"{point}_near" for point in reversed(POINTS)] + [f"{point}_far" for point in POINTS]
-    return {
-        f"{finger}_{point}": (round(share * width_px, 1), round((k + 0.7) / (len(order) + 0.8) * height_px, 1))
-        for finger, share in _COLUMNS.items()
-        for k, point in enumerate(order)
-    }

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -33,8 +33,6 @@ from gripmon.teach.corner_pose import (
     CornerPose,
     PoseRefused,
     Prior,
-    Snapped,
-    SnappedCorner,
     corners_fault,
     place,
     pose_from_corners,
@@ -45,13 +43,11 @@ from gripmon.teach.kept import promise_of
 from gripmon.teach.measure import Taught, teach
 from gripmon.teach.messages import (
     BadRequest,
-    CornerReply,
     CornersRequest,
+    Evaluation,
     Expectation,
     PictureInfo,
     Place,
-    ReferenceReply,
-    Reply,
     Saved,
     SaveOrder,
     SavingRefused,
@@ -66,18 +62,6 @@ from gripmon.track.edges.taught import own_covariance
 
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
-
-
-class Evaluation(NamedTuple):
-    """Everything that follows from corners set by hand in one image: the resulting (or known) ``reference``, None with
-    the reason as a text; ``expected`` None where too few edges are in view to measure anything.
-    """
-
-    snapped: Snapped
-    pose: CornerPose | None
-    reference: ReferenceRecord | None
-    no_reference: str | None
-    expected: Expectation | None
 
 
 @dataclass(frozen=True)
@@ -116,19 +100,19 @@ class Setup:
         """
         known = self.reference is not None
         snapper = Snapper(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m)
-        snapped = snapper.snap(image, put_px, jaw_opening_m, self.prior(jaw_opening_m), known)
+        snapped, seen = snapper.snap(image, put_px, jaw_opening_m, self.prior(jaw_opening_m), known)
         pose, reference, why, expected = None, self.reference, None, None
         if reference is None:
             try:
                 exact = self.settings.model_sigma_m == 0.0
                 fixed = {name: put_px[name] for name in by_hand if name in put_px}
-                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error, exact)
+                pose = pose_from_corners(self.camera, self.gripper, snapped, seen, fixed, self.camera_error, exact)
                 reference = _reference_of(pose)
             except PoseRefused as refused:
                 why = str(refused)
         if reference is not None:
             expected = self._expected(image, reference, snapped.jaw_opening_m)
-        return Evaluation(snapped, pose, reference, why, expected)
+        return Evaluation(snapped=snapped, pose=pose, reference=reference, no_reference=why, expected=expected)
 
     def _expected(self, image: Image, reference: ReferenceRecord, jaw_opening_m: float | None) -> Expectation | None:
         """The numbers that ``gripmon check`` prints, with what this image alone would teach."""
@@ -231,9 +215,9 @@ class TeachSession:
             **vars(self._labels),
         )
 
-    def look(self, put: CornersRequest) -> Reply:
+    def look(self, put: CornersRequest) -> Evaluation:
         """Snap.  Raises :class:`BadRequest`."""
-        return reply(self._evaluated(put, self._picture(put.image)))
+        return self._evaluated(put, self._picture(put.image))
 
     def take(self) -> tuple[PictureInfo, ...]:
         """Keep the live image.  Raises :class:`BadRequest`."""
@@ -334,49 +318,6 @@ class TeachSession:
         return Picture("live", frame.image, frame.jaw_opening_m, None)
 
 
-def reply(found: Evaluation) -> Reply:
-    """The evaluation as a message."""
-    snapped = found.snapped
-    return Reply(
-        corners=tuple(_corner(corner) for corner in snapped.corners),
-        outlines_px={name: _places(line) for name, line in snapped.outlines_px.items()},
-        edge_points_px=_places(snapped.edge_points_px),
-        share=snapped.share,
-        refused=snapped.refused,
-        jaw_opening_m=snapped.jaw_opening_m,
-        jaw_sigma_m=snapped.jaw_sigma_m,
-        reference=None if found.reference is None else _reference_reply(found.reference, found.pose),
-        no_reference=found.no_reference,
-        expected=found.expected,
-    )
-
-
-def _reference_reply(reference: ReferenceRecord, pose: CornerPose | None) -> ReferenceReply:
-    return ReferenceReply(
-        id=reference.reference_id,
-        sigma=tuple(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()).tolist()),
-        corners=None if pose is None else len(pose.corners),
-        rival=pose is not None and pose.rival,
-    )
-
-
-def _corner(corner: SnappedCorner) -> CornerReply:
-    covariance = None if corner.covariance_px is None else corner.covariance_px.ravel().tolist()
-    return CornerReply(
-        name=corner.name,
-        model_px=_place(corner.model_px),
-        uv_px=None if corner.uv_px is None else _place(corner.uv_px),
-        covariance_px2=None if covariance is None else (covariance[0], covariance[1], covariance[3]),
-        sigma_px=corner.sigma_px,
-        inliers=corner.inliers,
-        reason=corner.reason,
-    )
-
-
 def _place(at: Array) -> Place | None:
     u, v = np.asarray(at, dtype=float).tolist()
     return (round(u, 4), round(v, 4)) if np.isfinite(at).all() else None
-
-
-def _places(points: Array) -> tuple[Place, ...]:
-    return tuple((u, v) for u, v in np.round(points, 3).tolist())

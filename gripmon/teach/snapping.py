@@ -70,8 +70,8 @@ class Snapper:
 
     def snap(
         self, image: Image, put_px: Mapping[str, Array], jaw_opening_m: float | None, prior: Prior, known: bool
-    ) -> Snapped:
-        """Search for the gripper.
+    ) -> tuple[Snapped, Measurement | None]:
+        """Search for the gripper; what is seen, and the measurement of it, None where nothing is found.
 
         ``put_px`` (name: (2,)): the corners set by hand; ``jaw_opening_m`` None where it isn't reported; ``known``: the
         prior is a calibration, so that no corner has to be set.  Never raises because of the image's content.
@@ -182,17 +182,23 @@ class Snapper:
         uv_px = self.camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
 
-    def _rough(self, placed: PlacedPose, opening_m: float, why: str) -> Snapped:
+    def _rough(self, placed: PlacedPose, opening_m: float, why: str) -> tuple[Snapped, None]:
         pose = placed.cam_T_grip
         corners = tuple(
-            SnappedCorner(name, at, None, None, None, None, REASONS[CornerFault.NO_FIT])
+            SnappedCorner(name, _known(at), None, None, None, None, REASONS[CornerFault.NO_FIT])
             for name, at in self._corners_px(pose, opening_m).items()
         )
-        known_m = opening_m if self.gripper.has_jaw else None
-        outlines = outlines_px(self.camera, self.gripper, pose, opening_m)
-        return Snapped(pose, corners, outlines, np.zeros((0, 2)), 0.0, known_m, None, why, None)
+        return Snapped(
+            cam_T_grip=pose,
+            corners=corners,
+            outlines_px=outlines_px(self.camera, self.gripper, pose, opening_m),
+            edge_points_px=np.zeros((0, 2)),
+            share=0.0,
+            jaw_opening_m=opening_m if self.gripper.has_jaw else None,
+            refused=why,
+        ), None
 
-    def _measured(self, found: Measurement, jaw_opening_m: float | None) -> Snapped:
+    def _measured(self, found: Measurement, jaw_opening_m: float | None) -> tuple[Snapped, Measurement]:
         gripper = self.gripper
         has_jaw = gripper.has_jaw
         opening_m = found.jaw_opening_m if jaw_opening_m is None else jaw_opening_m
@@ -200,23 +206,18 @@ class Snapper:
         if has_jaw and jaw_opening_m is None:
             jaw_sigma_m = float(np.sqrt(found.covariance[6, 6]))
         model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m if has_jaw else None)
-        corners = tuple(
-            self._corner(found, index, name, model_px[name]) for index, name in enumerate(gripper.corner_ids)
-        )
         sample = found.candidates.sample[found.consensus.weight > 0.0]
         offset_px = found.candidates.offset_px[found.consensus.weight > 0.0]
         prediction = found.prediction
         return Snapped(
-            found.cam_T_grip,
-            corners,
-            outlines_px(self.camera, gripper, found.cam_T_grip, found.jaw_opening_m),
-            prediction.uv_px[sample] + offset_px[:, None] * prediction.normal[sample],
-            found.consensus.share,
-            opening_m if has_jaw else None,
-            jaw_sigma_m if has_jaw else None,
-            None,
-            found,
-        )
+            cam_T_grip=found.cam_T_grip,
+            corners=tuple(self._corner(found, k, name, model_px[name]) for k, name in enumerate(gripper.corner_ids)),
+            outlines_px=outlines_px(self.camera, gripper, found.cam_T_grip, found.jaw_opening_m),
+            edge_points_px=prediction.uv_px[sample] + offset_px[:, None] * prediction.normal[sample],
+            share=float(found.consensus.share),
+            jaw_opening_m=opening_m if has_jaw else None,
+            jaw_sigma_m=jaw_sigma_m if has_jaw else None,
+        ), found
 
     def _corner(self, found: Measurement, index: int, name: str, model_px: Array) -> SnappedCorner:
         corners, consensus, layout = found.corners, found.consensus, found.prediction.layout
@@ -224,11 +225,16 @@ class Snapper:
         inliers = float(consensus.supported[mine].mean()) if mine.any() else None
         fault = corners.fault[index]
         if fault is not None:
-            return SnappedCorner(name, model_px, None, None, None, inliers, REASONS.get(fault, fault.value))
+            return SnappedCorner(name, _known(model_px), None, None, None, inliers, REASONS.get(fault, fault.value))
         lens = found.prediction.corners.d_uv_d_xy[index]
         covariance_px = lens @ corners.covariance_xy[index] @ lens.T
         sigma_px = float(corners.sigma_px[index])
-        return SnappedCorner(name, model_px, corners.uv_px[index], covariance_px, sigma_px, inliers, None)
+        return SnappedCorner(name, _known(model_px), corners.uv_px[index], covariance_px, sigma_px, inliers, None)
+
+
+def _known(at: Array) -> Array | None:
+    """A position (2,); None beyond the lens."""
+    return at if np.isfinite(at).all() else None
 
 
 def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | None:

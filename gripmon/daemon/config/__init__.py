@@ -141,16 +141,23 @@ class Config:
 
 
 def load_config(
-    path: str | Path, *, check_source: bool = True, with_taught: bool = True, say_gone: bool = True
+    path: str | Path,
+    *,
+    check_source: bool = True,
+    with_taught: bool = True,
+    say_gone: bool = True,
+    text: str | None = None,
+    taught: TaughtModel | None = None,
 ) -> Config:
     """Read and check a configuration, a file or a project's folder that holds one.  Raises :class:`ConfigError`.
 
     ``check_source=False``: don't check that the source's files exist, for callers with their own input;
     ``with_taught=False``: ignore the taught model, for callers that teach it again; ``say_gone=False``: of settings
-    that are gone only those that had an effect are told, for files that can't be edited.
+    that are gone only those that had an effect are told, for files that can't be edited.  ``text``: what the file will
+    hold, and ``taught`` its taught model, where these aren't written yet.
     """
     path = file_of(Path(path), "config")
-    values = read_configuration(path)
+    values = read_configuration(path, text)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
     camera = _camera(path, settings, calibrated)
@@ -176,7 +183,7 @@ def load_config(
             load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
         raise ConfigError.of(path, fault)
-    return _with_taught(config) if with_taught else config
+    return _with_taught(config, taught) if with_taught else config
 
 
 def _within(values: object, *keys: str) -> dict[str, object]:
@@ -238,15 +245,17 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
         raise ConfigError.of(file, error.fault._replace(key=key)) from None
 
 
-def _with_taught(config: Config) -> Config:
+def _with_taught(config: Config, model: TaughtModel | None = None) -> Config:
     """The configuration with its taught model, if it names one; refused unless it was taught with the same camera,
     gripper and settings.  What the file doesn't say of the grey levels' response holds as taught.
     """
     settings = config.settings
     if settings.taught is None:
         return config
-    path = named_file(config.path, "taught", settings.taught, "a file of gripmon teach")
-    model = read_settings(path, TaughtModel)
+    path = config.directory / settings.taught
+    if model is None:
+        path = named_file(config.path, "taught", settings.taught, "a file of gripmon teach")
+        model = read_settings(path, TaughtModel)
     if not config.says_response:
         monitor = settings.monitor.with_response(model.edge_settings.response)
         settings = msgspec.structs.replace(settings, monitor=monitor)

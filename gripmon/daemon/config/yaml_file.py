@@ -131,13 +131,15 @@ def builtin_config(name: str) -> Path:
     raise FileNotFoundError(f"{name} is not among the installed configuration files")
 
 
-def read_configuration(path: Path) -> dict[str, Any]:
-    """The mapping in a configuration.  :class:`ConfigError`, which names the type of any other gripmon file."""
+def read_configuration(path: Path, text: str | None = None) -> dict[str, Any]:
+    """The mapping in a configuration, or in what it will hold.  :class:`ConfigError`, which names the type of any other
+    gripmon file.
+    """
     if path.parts[:1] == ("configs",) and not path.exists():  # as examples name them, in a checkout
         with contextlib.suppress(FileNotFoundError):
             shipped = builtin_config(str(path.relative_to("configs")))
             raise ConfigError(path, "", "there is no such file", f"the one that comes with gripmon is {shipped}")
-    values = read_yaml(path)
+    values = read_yaml(path) if text is None else _mapping(path, text)
     kind = kind_of(values)
     if kind is not None and kind != "a configuration":
         right = "a configuration, such as gripmon teach writes"

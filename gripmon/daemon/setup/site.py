@@ -17,12 +17,12 @@ from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.project import VIEW, Project, StepState
 from gripmon.daemon.setup.running import MonitorProcess, MonitorView
 from gripmon.daemon.setup.steps import STEPS, grippers
-from gripmon.daemon.teaching import outline_session, page_session, read_inputs
+from gripmon.daemon.teaching import outline_page, page_session, read_inputs
 from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.targets import OtherSizeError
 from gripmon.teach.messages import BadRequest, EmptyRequest, Request
-from gripmon.teach.page_server import Action, OutlineSession, Served, TeachSite, web_files
-from gripmon.teach.session import TeachSession
+from gripmon.teach.page_server import Action, Served, web_files
+from gripmon.teach.sites import OutlineSite, TeachSite
 
 _Name = Annotated[str, Meta(max_length=40)]
 _Answers = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
@@ -92,13 +92,13 @@ class SetupSite:
 
     def __init__(self, project: Project) -> None:
         self._project = project
-        self._files = web_files("setup.html", "style.css", "setup.css", "icon.svg", "setup.js", "mount.js", "server.js")
+        self._files = web_files("setup.html")
         self._lock = threading.Lock()
         self._busy: str | None = None
         self._said: dict[str, tuple[Line, ...]] = {"check": tuple(project.checked())}
         self._errors: dict[str, str] = {}
         self._capture: tuple[str, Capture] | None = None
-        self._page: tuple[TeachSite, TeachSession | OutlineSession] | None = None
+        self._page: TeachSite | OutlineSite | None = None
         self._monitor = MonitorProcess(project.folder)
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class SetupSite:
             return self._files[path]
         page = self._page
         if path.startswith("page/") and page is not None:
-            return page[0].get(path.removeprefix("page/"))
+            return page.get(path.removeprefix("page/"))
         if path == "state":
             return msgspec.json.encode(self.state()), "application/json"
         if path == "live.jpg" and self._capture is not None:
@@ -130,7 +130,7 @@ class SetupSite:
         if path == "page/done":
             return EmptyRequest, lambda _: self._close_page()
         if path.startswith("page/"):
-            return None if page is None else page[0].post(path.removeprefix("page/"))
+            return None if page is None else page.post(path.removeprefix("page/"))
         actions: dict[str, Action] = {
             "do": (StepRequest, self._do),
             "capture": (CaptureOrder, self._captured),
@@ -259,30 +259,27 @@ class SetupSite:
         if state.progress == "waits":
             raise BadRequest(state.note)
         with self._shown_at(order.step):
-            session = self._session(order.step, state.command)
-        saves = ("corners",) if order.step == "corners" else ("config", "taught", "corners")
-        self._page = TeachSite(session, f"../#{order.step}", saves), session
+            self._page = self._opened(order.step, state.command)
         return {"url": "page/"}
 
-    def _session(self, step: str, command: str) -> TeachSession | OutlineSession:
-        values, camera = self._project.values, Path("camera.yaml")
+    def _opened(self, step: str, command: str) -> TeachSite | OutlineSite:
+        values, camera, back = self._project.values, Path("camera.yaml"), f"../#{step}"
         images = [Path("standing" if step == "corners" else "teaching") / name for name in self._images(step)]
         if step == "corners" and values["gripper"] == entries.INFERRED:
-            return outline_session(images[0], camera, Path("standing"))
+            return outline_page(images[0], camera, Path("standing"), back)
         corners = step == "corners"
-        return page_session(
-            read_inputs(
-                images[:1] if corners else images,
-                command=command,
-                out=Path("standing" if corners else "."),
-                camera=camera,
-                gripper=Path("gripper.yaml"),
-                reference=None if corners or values["reference_by"] == entries.BY_CORNERS else Path("hand_eye.yaml"),
-                source=None if corners else values["source"],
-                robot=values["robot"],
-                camera_name=values["camera_name"],
-            )
+        inputs = read_inputs(
+            images[:1] if corners else images,
+            command=command,
+            out=Path("standing" if corners else "."),
+            camera=camera,
+            gripper=Path("gripper.yaml"),
+            reference=None if corners or values["reference_by"] == entries.BY_CORNERS else Path("hand_eye.yaml"),
+            source=None if corners else values["source"],
+            robot=values["robot"],
+            camera_name=values["camera_name"],
         )
+        return TeachSite(page_session(inputs), back, ("corners",) if corners else None)
 
     def _images(self, step: str) -> tuple[str, ...]:
         return Capture(self._project.folder / ("standing" if step == "corners" else "teaching"), None).images()
@@ -315,4 +312,4 @@ class SetupSite:
     def _close_page(self) -> None:
         page, self._page = self._page, None
         if page is not None:
-            page[1].close()
+            page.close()

@@ -34,8 +34,8 @@ from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_picture, told_response
 from gripmon.teach.corner_pose import corners_fault
 from gripmon.teach.outlines import RoughCorners
-from gripmon.teach.page_server import OutlineSession
 from gripmon.teach.session import Setup
+from gripmon.teach.sites import OutlineSite
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 
@@ -149,7 +149,7 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     return corners
 
 
-def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
+def outline_page(image: Path, camera: Path | None, folder: Path, back: str | None = None) -> OutlineSite:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
     shown, target = image_in(image), None
     camera = None if camera is None else file_of(camera, "camera")
@@ -169,7 +169,7 @@ def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSe
     )
     note = f"{plate}; with jaws that move also --jaw-range MIN:MAX (m)"
     picture = Picture(image.name, shown, None, str(image))
-    return OutlineSession(picture, folder / ROUGH, shlex.join(map(str, words)), note)
+    return OutlineSite(picture, folder / ROUGH, shlex.join(map(str, words)), note, back)
 
 
 def _gripper(path: Path | None) -> tuple[Gripper, Path]:

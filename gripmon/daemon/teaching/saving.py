@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
@@ -18,7 +15,6 @@ from gripmon.calibrate.grey_levels import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
 from gripmon.daemon.config.project import FILES
 from gripmon.daemon.config.writing import with_taught
-from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
 from gripmon.daemon.teaching.written import config_text
 from gripmon.io.sources import SourceError, open_source
@@ -27,10 +23,10 @@ from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
-from gripmon.model.yaml_text import as_yaml, yaml_value
+from gripmon.model.yaml_text import yaml_value
 from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
-from gripmon.teach.messages import CornersRequest, Saved, SaveOrder, SavingRefused
-from gripmon.teach.session import Evaluation, Labels, TeachSession
+from gripmon.teach.messages import CornersRequest, Evaluation, Saved, SaveOrder, SavingRefused
+from gripmon.teach.session import Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtEdges, TaughtModel
@@ -96,7 +92,7 @@ class FileSaving:
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
             texts["config"] = self._config(order, found, model is not None)
-        self._try_out(texts)
+            self._try_out(texts["config"], model)
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
         follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
@@ -192,31 +188,15 @@ class FileSaving:
             return with_taught(given.path, self._paths["taught"])
         return config_text(self._inputs, order, found, TAUGHT if taught else None)
 
-    def _try_out(self, texts: Mapping[str, str]) -> None:
-        """Check in a temporary folder that the configuration is valid; otherwise nothing is written."""
-        if "config" not in texts:
-            return
-        base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
-        with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
-            trial = Path(name) / CONFIG
-            trial.write_text(texts["config"], encoding="utf-8")
-            try:
-                values = read_yaml(trial)
-                given = values.get("reference")
-                for section, key in (
-                    (values, "gripper"), (values, "camera"), (values, "reference"),
-                    (given if isinstance(given, dict) else {}, "hand_eye"),
-                ):  # fmt: skip
-                    if isinstance(section.get(key), str):
-                        section[key] = str((base / section[key]).resolve())
-                if "taught" in texts:
-                    (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
-                    values["taught"] = TAUGHT
-                trial.write_text(as_yaml(values), encoding="utf-8")
-                load_config(trial, check_source=False, with_taught="taught" in texts)
-            except (ConfigError, yaml.YAMLError, OSError) as error:
-                wrong = str(error).replace(f"{name}{os.sep}", "")
-                raise SavingRefused(f"the configuration would be refused: {wrong}") from None
+    def _try_out(self, text: str, model: TaughtModel | None) -> None:
+        """Check that the configuration will be valid; otherwise nothing is written."""
+        try:
+            load_config(
+                self._paths["config"], check_source=False, with_taught=model is not None, say_gone=False, text=text,
+                taught=model,
+            )  # fmt: skip
+        except ConfigError as error:
+            raise SavingRefused(f"the configuration would be refused: {error}") from None
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Write each file whole or not at all; the configuration last, since it names the others."""

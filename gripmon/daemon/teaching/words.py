@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gripmon.teach.accuracy import PoseValues
-from gripmon.teach.session import Evaluation
+from gripmon.teach.messages import Evaluation
 
 
 def in_words(found: Evaluation) -> list[str]:

@@ -15,8 +15,7 @@ from gripmon.io.sources import FolderSettings, SourceError
 from gripmon.io.sources.files import opening_beside
 from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.records import ValidBy
-from gripmon.teach.messages import SaveOrder
-from gripmon.teach.session import Evaluation
+from gripmon.teach.messages import Evaluation, SaveOrder
 
 
 def config_text(inputs: Inputs, order: SaveOrder, found: Evaluation, taught: str | None) -> str:

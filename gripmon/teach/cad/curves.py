@@ -45,8 +45,7 @@ class Curve:
 def pieces_of(surface: Surface, eye_m: Array) -> Pieces:
     """All lines of a surface that the eye (3,) may see, including those that something hides."""
     facing = _Facing(surface, eye_m)
-    found = [_lines(surface), *facing.rounds()]
-    found.append(facing.sharp_edges())
+    found = [*facing.rounds(), facing.sharp_edges()]
     return Pieces(
         np.concatenate([p.points_m for p in found]),
         list(itertools.chain.from_iterable(p.keys for p in found)),
@@ -54,12 +53,6 @@ def pieces_of(surface: Surface, eye_m: Array) -> Pieces:
         np.concatenate([p.centre_m for p in found]),
         np.concatenate([p.wanders for p in found]),
     )
-
-
-def _lines(surface: Surface) -> Pieces:
-    ends = surface.points_m[surface.lines]
-    keys = [((a, a, -1), (b, b, -1)) for a, b in surface.lines.tolist()]
-    return Pieces(ends, keys, np.zeros(len(ends), bool), np.full(ends.shape, np.nan), np.zeros(len(ends), bool))
 
 
 class _Facing:

@@ -1,14 +1,13 @@
-"""Reads meshes and ViSP's .cao files into bodies in metres."""
+"""Reads meshes and ViSP's .cao files as meshes of trimesh, in metres."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +16,15 @@ from gripmon.model.errors import InputError, one_line
 from gripmon.model.gripper.faces import triangles as cut_into_triangles
 from gripmon.model.records import Array
 
-Triangles = NDArray[np.intp]
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 MESHES = (".stl", ".obj", ".ply", ".dae")
 LARGEST_TRIANGLES = 5_000_000
 """Most triangles: finding neighbours then takes about 2 GB of memory; no CAD export of a gripper needs more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """Triangles (t, 3) over points (p, 3), metres, in the frame of its file; ``lines`` (l, 2): edges that the file has
-    without a face.  Triangles share their common points.
-    """
-
-    name: str
-    points_m: Array
-    triangles: Triangles
-    lines: NDArray[np.intp]
-
-    def moved(self, to_T_body: Array) -> Body:
-        """The same in another frame (4, 4); a mirroring transform reverses the triangles."""
-        triangles = self.triangles if np.linalg.det(to_T_body[:3, :3]) > 0.0 else self.triangles[:, ::-1]
-        return Body(self.name, self.points_m @ to_T_body[:3, :3].T + to_T_body[:3, 3], triangles, self.lines)
+ROUND = 96
+"""Sides of a round part that a file gives by its radius: 0.0043 mm off a circle of 8 mm."""
 
 
 def mesh_library(why: str) -> ModuleType:
@@ -51,7 +36,7 @@ def mesh_library(why: str) -> ModuleType:
     return trimesh
 
 
-def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
+def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Trimesh:
     """Read a mesh in metres; ``unit`` is one of :data:`UNITS_M`.  ``size``: refuse one that can't be a gripper's.
 
     Raises :class:`InputError` for a file that can't be read, has no triangles or too many, or whose unit wasn't given:
@@ -68,32 +53,33 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Body:
         if collada:
             mesh.apply_scale(trimesh.units.unit_conversion(mesh.units or "meters", "meters"))
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.intp)
+        mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)  # without its looks
+        mesh.remove_unreferenced_vertices()
     except Exception as error:  # noqa: BLE001  trimesh raises anything for a damaged file
         # A binary STL that is cut off is tried as text, for which trimesh wants one more library.
         cut_off = isinstance(error, ModuleNotFoundError)
         why = "it is damaged or cut off" if cut_off else f"{one_line(error):.120}"
         raise InputError(f"{path}: can't be read as a mesh ({why}); {', '.join(MESHES)} with triangles") from None
-    if not len(triangles):
+    if not len(mesh.faces):
         raise InputError(f"{path}: has no triangles, or is cut off; a mesh of the fingers' surface")
-    if len(triangles) > LARGEST_TRIANGLES:
-        raise InputError(f"{path}: {len(triangles)} triangles; at most {LARGEST_TRIANGLES}, exported more coarsely")
-    if not np.isfinite(points[triangles]).all():
+    if len(mesh.faces) > LARGEST_TRIANGLES:
+        raise InputError(f"{path}: {len(mesh.faces)} triangles; at most {LARGEST_TRIANGLES}, exported more coarsely")
+    if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path}: holds a coordinate that is not finite; ordinary numbers")
-    extent = np.ptp(points[np.unique(triangles)], axis=0)
+    extent = mesh.extents
     unit = "m" if collada else unit
     if unit is None:
         raise InputError(f"is missing: {path} has no unit; {_as_units(extent)}", "unit")
-    body = Body(path.stem, points * UNITS_M[unit], triangles, np.zeros((0, 2), np.intp))
-    return checked_size(body, str(path), extent, "unit") if size else body
+    mesh.apply_scale(UNITS_M[unit])
+    return checked_size(mesh, str(path), extent, "unit") if size else mesh
 
 
-def checked_size(body: Body, what: str, extent: Array, argument: str) -> Body:
-    """The body; :class:`InputError` if it is smaller than a finger's detail or larger than a robot's hand."""
-    size_m = float(np.ptp(body.points_m, axis=0).max())
+def checked_size(mesh: Trimesh, what: str, extent: Array, argument: str) -> Trimesh:
+    """The mesh; :class:`InputError` if it is smaller than a finger's detail or larger than a robot's hand."""
+    size_m = float(mesh.extents.max())
     if not 1e-3 <= size_m <= 1.0:
         raise InputError(f"{what} would be {1e3 * size_m:g} mm long; {_as_units(extent)}", argument)
-    return body
+    return mesh
 
 
 def _as_units(extent: Array) -> str:
@@ -107,40 +93,21 @@ def _as_units(extent: Array) -> str:
     return f"it spans {size}, that is in {', in '.join(sizes)}; one of {', '.join(UNITS_M)}"
 
 
-def separate(body: Body) -> list[Body]:
-    """The body's connected pieces, the largest first; pieces of lines alone count, too."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.concatenate([body.triangles[:, [0, 1]], body.triangles[:, [1, 2]], body.lines])
-    count = len(body.points_m)
-    graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    of_triangle, of_line = label[body.triangles[:, 0]], label[body.lines[:, 0]]
-    used = np.unique(np.concatenate([of_triangle, of_line]))
-    pieces = []
-    for one in used:
-        points = np.flatnonzero(label == one)
-        renumbered = np.zeros(count, dtype=np.intp)
-        renumbered[points] = np.arange(len(points))
-        own = renumbered[body.triangles[of_triangle == one]], renumbered[body.lines[of_line == one]]
-        pieces.append(Body(body.name, body.points_m[points], *own))
-    return sorted(pieces, key=lambda piece: -float(np.prod(np.ptp(piece.points_m, axis=0) + 1e-6)))
+def separate(mesh: Trimesh) -> list[Trimesh]:
+    """The mesh's connected pieces, the largest first."""
+    graph = mesh_library("bodies").graph
+    label = graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
+    pieces: list[Trimesh] = mesh.submesh([np.flatnonzero(label == one) for one in np.unique(label)], repair=False)  # type: ignore[assignment]
+    return sorted(pieces, key=lambda piece: -float(np.prod(piece.extents + 1e-6)))
 
 
-def joined(bodies: list[Body], name: str) -> Body:
-    """Several bodies as one."""
-    first = np.cumsum([0] + [len(b.points_m) for b in bodies[:-1]]).tolist()
-    return Body(
-        name,
-        np.concatenate([b.points_m for b in bodies]),
-        np.concatenate([b.triangles + n for b, n in zip(bodies, first, strict=True)]),
-        np.concatenate([b.lines + n for b, n in zip(bodies, first, strict=True)]),
-    )
+def joined(meshes: list[Trimesh]) -> Trimesh:
+    """Several meshes as one."""
+    return mesh_library("bodies").util.concatenate(meshes)
 
 
 class _Cao:
-    """Reads the lines of a .cao file, without comments, one after another."""
+    """Reads a .cao file section by section; of its lines what isn't a comment."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -148,10 +115,8 @@ class _Cao:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: can't be read ({error}); a .cao file of ViSP's") from None
-        bare = (re.sub(r"(#|//).*", "", line).strip() for line in text.splitlines())
-        self._lines: Iterator[tuple[int, list[str]]] = iter(
-            [(number, line.split()) for number, line in enumerate(bare, start=1) if line]
-        )
+        bare = (re.sub(r"(#|//).*", "", line).split() for line in text.splitlines())
+        self._lines = iter([(number, words) for number, words in enumerate(bare, start=1) if words])
         self.number, words = next(self._lines, (1, [""]))
         if words[0].upper() != "V1":
             self.refuse("doesn't begin with V1; ViSP's format of 3D models, version 1")
@@ -159,68 +124,76 @@ class _Cao:
     def refuse(self, wrong: str) -> NoReturn:
         raise InputError(f"{self.path}, line {self.number}: {wrong}")
 
-    def words(self) -> list[str]:
+    def _words(self) -> list[str]:
         """The next line's words, without settings such as ``name=…``; empty at the end."""
         self.number, words = next(self._lines, (self.number, []))
         if words and words[0].startswith("load("):
             self.refuse("loads another file; the models in one file")
         return [word for word in words if "=" not in word]
 
-    def count(self, what: str) -> int:
-        """The number of items that follow; 0 at the end of the file."""
-        words = self.words()
-        if not words:
-            return 0
-        if not words[0].isdecimal():
-            self.refuse(f"'{words[0]}' is not a number of {what}; a whole number")
-        return int(words[0])
+    def section(self, name: str, one: str, count: int) -> Iterator[list[float]]:
+        """The first ``count`` numbers of each line of the next section; none where the file has ended."""
+        for words in self._lines_of(name):
+            try:
+                values = [float(word) for word in words[:count]]
+            except ValueError:
+                values = []
+            if len(values) < count or not np.isfinite(values).all():
+                self.refuse(f"'{' '.join(words)}' is not {one}; {count} ordinary numbers")
+            yield values
 
-    def indices(self, count: int, below: int, what: str) -> list[int]:
-        """The next line's indices, at least ``count`` of them, from 0 to ``below`` - 1."""
-        words = self.words()
-        if len(words) < count or not all(word.isdecimal() and int(word) < below for word in words):
-            self.refuse(f"'{' '.join(words)}' is not {what}; at least {count} numbers from 0 to {below - 1}")
-        return [int(word) for word in words]
+    def indices(self, name: str, one: str, count: int, below: int) -> Iterator[list[int]]:
+        """The same of indices, at least ``count`` of them, from 0 to ``below`` - 1."""
+        for words in self._lines_of(name):
+            if len(words) < count or not all(word.isdecimal() and int(word) < below for word in words):
+                self.refuse(f"'{' '.join(words)}' is not {one}; at least {count} numbers from 0 to {below - 1}")
+            yield [int(word) for word in words]
 
-    def numbers(self, count: int, what: str) -> list[float]:
-        words = self.words()
-        try:
-            values = [float(word) for word in words[:count]]
-        except ValueError:
-            values = []
-        if len(values) < count or not np.isfinite(values).all():
-            self.refuse(f"'{' '.join(words)}' is not {what}; {count} ordinary numbers")
-        return values
+    def _lines_of(self, name: str) -> Iterator[list[str]]:
+        number, *_ = self._words() or ["0"]
+        if not number.isdecimal():
+            self.refuse(f"'{number}' is not a number of {name}; a whole number")
+        for _ in range(int(number)):
+            yield self._words()
 
 
-def read_cao(path: Path) -> Body:
+def read_cao(path: Path) -> Trimesh:
     """Read a 3D model of ViSP's (https://visp-doc.inria.fr, tutorial "Markerless generic model-based tracking"),
     metres: points, lines, faces of lines, faces of points, cylinders, circles.  Faces that aren't flat become
-    triangles.
+    triangles; lines count as sides of faces alone, since nothing tells what a line by itself hides.
     """
-    cao = _Cao(path)
-    points = [cao.numbers(3, "a point") for _ in range(cao.count("points"))]
+    cao, trimesh = _Cao(path), mesh_library(str(path))
+    points = np.reshape(np.array([*cao.section("points", "a point", 3)]), (-1, 3))
     most = len(points)
-    lines = [cao.indices(2, most, "a line's two points")[:2] for _ in range(cao.count("lines"))]
+    lines = [line[:2] for line in cao.indices("lines", "a line's two points", 2, most)]
     loops = []
-    for _ in range(cao.count("faces")):
-        _, *sides = cao.indices(4, max(len(lines), most) + 1, "a face's lines")
+    for _, *sides in cao.indices("faces", "a face's lines", 4, max(len(lines), most) + 1):
         loops.append(_loop_of_lines(cao, [lines[k] for k in sides]))
-    for _ in range(cao.count("faces")):
-        number, *loop = cao.indices(4, most + 1, "a face's points")
+    for number, *loop in cao.indices("faces", "a face's points", 4, most + 1):
         if len(loop) != number or max(loop) >= most:
             cao.refuse(f"names {len(loop)} points, not {number}, or one that isn't there; the points in turn")
         loops.append(loop)
-    places = np.reshape(np.array(points, dtype=float), (-1, 3))
-    if not most:
-        cao.refuse("has no points; at least three")
-    whole = [Body(path.stem, places, _triangles_of(path, places, loops), np.reshape(lines, (-1, 2)).astype(np.intp))]
-    whole += [_cylinder(cao, places) for _ in range(cao.count("cylinders"))]
-    for _ in range(cao.count("circles")):
-        radius, a, b, c = cao.numbers(4, "a circle's radius and three points")
-        whole.append(_disc(radius, places[[int(a), int(b), int(c)]]))
-    body = joined(whole, path.stem)
-    return checked_size(body, str(path), np.ptp(body.points_m, axis=0), "")
+    parts = [trimesh.Trimesh(points, _triangles_of(path, points, loops), process=False)] if loops else []
+    for *ends, radius in cao.section("cylinders", "a cylinder's two points and radius", 3):
+        segment = _places(cao, points, ends)
+        parts.append(trimesh.creation.cylinder(radius, segment=segment, sections=ROUND))
+    for radius, *three in cao.section("circles", "a circle's radius and three points", 4):
+        centre, one, other = _places(cao, points, three)
+        at = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], np.cross(one - centre, other - centre))
+        at[:3, 3] = centre
+        parts.append(trimesh.creation.revolve([[0.0, 0.0], [radius, 0.0]], sections=ROUND, transform=at))
+    if not parts:
+        cao.refuse("has no faces; the surface of a finger, by faces, cylinders or circles")
+    mesh = joined(parts)
+    mesh.remove_unreferenced_vertices()
+    return checked_size(mesh, str(path), mesh.extents, "")
+
+
+def _places(cao: _Cao, points_m: Array, numbers: list[float]) -> Array:
+    """Points (n, 3) by their numbers."""
+    if any(number != int(number) or not 0 <= number < len(points_m) for number in numbers):
+        cao.refuse(f"names a point that isn't there; numbers from 0 to {len(points_m) - 1}")
+    return points_m[[int(number) for number in numbers]]
 
 
 def _loop_of_lines(cao: _Cao, sides: list[list[int]]) -> list[int]:
@@ -234,7 +207,7 @@ def _loop_of_lines(cao: _Cao, sides: list[list[int]]) -> list[int]:
     return [*loop[-1:], *loop[:-1]]
 
 
-def _triangles_of(path: Path, points_m: Array, loops: list[list[int]]) -> Triangles:
+def _triangles_of(path: Path, points_m: Array, loops: list[list[int]]) -> NDArray[np.intp]:
     out = []
     for number, loop in enumerate(loops):
         parts = cut_into_triangles(points_m[loop])
@@ -242,31 +215,3 @@ def _triangles_of(path: Path, points_m: Array, loops: list[list[int]]) -> Triang
             raise InputError(f"{path}, face {number}: crosses itself; the points in turn around the face")
         out += [[loop[k] for k in part] for part in parts]
     return np.reshape(np.array(out, dtype=np.intp), (-1, 3))
-
-
-_ROUND = 96  # sides of a .cao file's circles: 0.0043 mm off a circle of 8 mm
-
-
-def _ring(radius_m: float, centre: Array, axis: Array) -> Array:
-    """Points (n, 3) of a circle."""
-    across = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
-    across /= np.linalg.norm(across)
-    turn = 2.0 * np.pi * np.arange(_ROUND)[:, None] / _ROUND
-    return centre + radius_m * (np.cos(turn) * across + np.sin(turn) * np.cross(axis, across))
-
-
-def _cylinder(cao: _Cao, points_m: Array) -> Body:
-    words = cao.numbers(3, "a cylinder's two points and radius")
-    ends = points_m[[int(words[0]), int(words[1])]]
-    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    rings = np.concatenate([_ring(words[2], end, axis) for end in ends])
-    k, j = np.arange(_ROUND), np.roll(np.arange(_ROUND), -1)
-    wall = np.concatenate([np.column_stack([k, j, j + _ROUND]), np.column_stack([k, j + _ROUND, k + _ROUND])])
-    return Body("cylinder", rings, wall.astype(np.intp), np.zeros((0, 2), np.intp))
-
-
-def _disc(radius_m: float, places: Array) -> Body:
-    normal = np.cross(places[1] - places[0], places[2] - places[0])
-    ring = _ring(radius_m, places[0], normal / np.linalg.norm(normal))
-    fan = [(0, k, k + 1) for k in range(1, _ROUND - 1)]
-    return Body("circle", ring, np.array(fan, dtype=np.intp), np.zeros((0, 2), np.intp))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,8 +15,11 @@ from scipy.spatial.transform import Rotation
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array
-from gripmon.teach.cad.files import Body, joined
+from gripmon.teach.cad.files import joined
 from gripmon.teach.cad.urdf import Joint, Urdf
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 STEPS = 41
 """Number of joint positions that are evaluated: an arc of 57 mm over 0.8 rad is 2.8 um off a table of 41 rows."""
@@ -51,7 +55,7 @@ class LinkGroup:
     """
 
     links: tuple[str, ...]
-    body: Body
+    body: Trimesh
     path_m: Array
     turns_rad: float
 
@@ -66,7 +70,7 @@ class Linkage:
     joint: str
     base: str
     moving: list[LinkGroup]
-    still: dict[str, Body]
+    still: dict[str, Trimesh]
     pivot: Array | None
     moves: bool
     notes: list[str] = field(default_factory=list)
@@ -88,7 +92,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
     swept = drive if drive.ways else Drive({name: (v - 0.1, v + 0.1) for name, v in drive.stand.items()}, {})
     poses = [urdf.placed(base, swept.values(share)) for share in np.linspace(0.0, 1.0, STEPS).tolist()]
     drawn = poses[STEPS // 2]
-    bodies = {name: urdf.body(name).moved(drawn[name]) for name in drawn}
+    bodies = {name: urdf.body(name).apply_transform(drawn[name]) for name in drawn}
     groups: dict[bytes, list[str]] = {}
     still = {}
     for name in drawn:
@@ -102,7 +106,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
     for names in groups.values():
         way = np.array([pose[names[0]] for pose in poses])
         turned = Rotation.from_matrix(way[:, :3, :3]) * Rotation.from_matrix(drawn[names[0]][:3, :3]).inv()
-        body = joined([bodies[name] for name in names], names[0])
+        body = joined([bodies[name] for name in names])
         moving.append(
             LinkGroup(tuple(names), body, way[:, :3, 3] - drawn[names[0]][:3, 3], float(turned.magnitude().max()))
         )

@@ -6,16 +6,20 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gripmon.model.errors import InputError
 from gripmon.model.progress import Progress
 from gripmon.model.records import Array
-from gripmon.teach.cad.files import MESHES, Body, joined, read_cao, read_mesh, separate
+from gripmon.teach.cad.files import MESHES, joined, mesh_library, read_cao, read_mesh, separate
 from gripmon.teach.cad.frame import AXES, approach_of
 from gripmon.teach.cad.linkage import STEPS, TURNS_RAD, Linkage, LinkGroup, read_urdf
 from gripmon.teach.cad.surface import Surface, surface_of, welded
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 FORMATS = (*MESHES, ".urdf", ".cao")
 LONGEST_M = 0.3
@@ -83,10 +87,10 @@ def read_parts(
         else:
             origins, notes = tuple(path.name for path in paths), []
         surfaces = []
-        for each in bodies:
-            surfaces.append(_checked(surface_of(each), each.name))
+        for each, origin in zip(bodies, origins, strict=True):
+            surfaces.append(_checked(surface_of(each), origin))
             step()
-    return _named(surfaces, origins, [*notes, *_odd(surfaces, bodies)])
+    return _named(surfaces, origins, [*notes, *_odd(surfaces, origins)])
 
 
 def _check(paths: Sequence[Path]) -> None:
@@ -101,15 +105,15 @@ def _check(paths: Sequence[Path]) -> None:
             raise InputError(f"{path}: is named twice; a mesh for each finger, where it stands, or both in one file")
 
 
-def _bodies_in(whole: Body, text: str | None, path: str) -> tuple[list[Body], tuple[str, ...], list[str]]:
+def _bodies_in(whole: Trimesh, text: str | None, path: str) -> tuple[list[Trimesh], tuple[str, ...], list[str]]:
     """The fingers of a file with several bodies, as ``text`` chooses them: "all" for one finger, or numbers from 1, the
     largest body first, joined by + within a finger and separated by commas.
     """
-    pieces = separate(welded(whole))
+    pieces = separate(mesh_library(path).Trimesh(*welded(whole), process=False))
     if text is None:
         if len(pieces) == 1:
             return pieces, (path,), []
-        listed = [f"{k}: {_size(piece.points_m)}" for k, piece in enumerate(pieces[:MOST_NAMED], start=1)]
+        listed = [f"{k}: {_size(piece.extents)}" for k, piece in enumerate(pieces[:MOST_NAMED], start=1)]
         more = f", and {len(pieces) - MOST_NAMED} smaller" if len(pieces) > MOST_NAMED else ""
         raise InputError(
             f"is missing: {path} holds {len(pieces)} bodies ({'; '.join(listed)}{more}); all, if they are one finger, "
@@ -130,11 +134,11 @@ def _bodies_in(whole: Body, text: str | None, path: str) -> tuple[list[Body], tu
     left = len(pieces) - len(chosen)
     notes = [f"{path}: {left} of {len(pieces)} bodies are left out"] if left else []
     names = tuple(f"{path}, body {'+'.join(map(str, numbers))}" for numbers in fingers)
-    return [joined([pieces[n - 1] for n in numbers], whole.name) for numbers in fingers], names, notes
+    return [joined([pieces[n - 1] for n in numbers]) for numbers in fingers], names, notes
 
 
-def _size(points_m: Array) -> str:
-    return " x ".join(f"{1e3 * v:.1f}" for v in np.ptp(points_m, axis=0)) + " mm"
+def _size(extents_m: Array) -> str:
+    return " x ".join(f"{1e3 * v:.1f}" for v in extents_m) + " mm"
 
 
 def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | None) -> Parts:
@@ -150,8 +154,8 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
     along = _along(chosen if chosen and linkage.moves else straight)
     surfaces = [_checked(surface_of(group.body), group.links[0]) for group in chosen]
     if approach is None:
-        reaching = [group.body.points_m for group in straight or linkage.moving]
-        approach = approach_of(reaching, [each.points_m for each in linkage.still.values()], along, pivot)
+        reaching = [group.body.vertices for group in straight or linkage.moving]
+        approach = approach_of(reaching, [each.vertices for each in linkage.still.values()], along, pivot)
     if body is None and len(chosen) == 1:
         still = _beside(path, linkage, chosen[0], AXES[approach.split(",")[0]])
         if not still:
@@ -169,9 +173,8 @@ def _of_linkage(path: Path, linkage: Linkage, body: str | None, approach: str | 
         notes.append("the fingers stand: what moves isn't in the file")
     if not (linkage.moves and chosen):
         paths = []
-    bodies = [group.body for group in chosen] + [linkage.still[link] for link in still]
-    notes += [f"the CAD frame is that of link '{linkage.base}'", *_odd(surfaces, bodies)]
     origins = tuple([", ".join(group.links) for group in chosen] + still)
+    notes += [f"the CAD frame is that of link '{linkage.base}'", *_odd(surfaces, origins)]
     return replace(
         _named(surfaces, origins, notes, paths),
         around=[surface_of(each) for each in around],
@@ -213,9 +216,9 @@ def _along(groups: Sequence[LinkGroup]) -> Array | None:
 
 def _beside(path: Path, linkage: Linkage, group: LinkGroup, z: Array) -> list[str]:
     """The link that stands beside a single finger that moves: one that reaches into its front half."""
-    ends = group.body.points_m @ z
+    ends = group.body.vertices @ z
     middle = 0.5 * (ends.min() + ends.max())
-    reaching = [link for link, each in linkage.still.items() if (each.points_m @ z).max() > middle]
+    reaching = [link for link, each in linkage.still.items() if (each.vertices @ z).max() > middle]
     if len(reaching) > 1:
         raise InputError(
             f"is missing: {path}: beside finger {group.links[0]} stand the links {', '.join(reaching)}; the fingers, "
@@ -249,7 +252,7 @@ def _says(name: str, side: str) -> bool:
 
 
 def _checked(surface: Surface, name: str) -> Surface:
-    if not len(surface.triangles) and not len(surface.lines):
+    if not len(surface.triangles):
         raise InputError(f"{name}: no triangle has an area; a mesh of the finger's surface")
     if float(np.ptp(surface.points_m, axis=0).max()) > LONGEST_M:
         size = " x ".join(f"{1e3 * v:.0f}" for v in np.ptp(surface.points_m, axis=0))
@@ -259,15 +262,15 @@ def _checked(surface: Surface, name: str) -> Surface:
     return surface
 
 
-def _odd(surfaces: Sequence[Surface], bodies: Sequence[Body]) -> list[str]:
+def _odd(surfaces: Sequence[Surface], origins: Sequence[str]) -> list[str]:
     """Notes on surfaces too small for their unit, and on those that aren't closed: their borders show as edges."""
     out = []
-    for surface, body in zip(surfaces, bodies, strict=True):
+    for surface, origin in zip(surfaces, origins, strict=True):
         longest_m = float(np.ptp(surface.points_m, axis=0).max())
         if longest_m < SHORTEST_M:
-            out.append(f"{body.name}: a finger of {1e3 * longest_m:.2g} mm: is its unit right?")
+            out.append(f"{origin}: a finger of {1e3 * longest_m:.2g} mm: is its unit right?")
         count = int(np.count_nonzero(surface.border))
         if count:
             no = f"{count} sides of triangles have no neighbour"
-            out.append(f"{body.name}: the surface is open ({no}): borders are taken as edges")
+            out.append(f"{origin}: the surface is open ({no}): borders are taken as edges")
     return out

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from gripmon.model.gripper.faces import normal_of
 from gripmon.model.records import Array
-from gripmon.teach.cad.files import Body
+from gripmon.teach.cad.files import mesh_library
 from gripmon.teach.cad.surface import FLAT_M, Surface, surface_of
 
 MOST_FACES = 64
@@ -55,7 +53,7 @@ class Shape:
 def is_solid(surface: Surface) -> bool:
     """Whether a finger is a convex solid with flat faces, which a gripper file describes for all views."""
     faces = int(surface.patch.max(initial=-1)) + 1
-    if not 4 <= faces <= MOST_FACES or not surface.closed or not surface.flat() or len(surface.lines):
+    if not 4 <= faces <= MOST_FACES or not surface.closed or not surface.flat():
         return False
     normals = np.array([surface.normals[surface.patch == k].mean(axis=0) for k in range(faces)])
     first = np.array([surface.points_m[surface.triangles[surface.patch == k][0, 0]] for k in range(faces)])
@@ -66,27 +64,9 @@ def is_solid(surface: Surface) -> bool:
 
 def cut(surface: Surface, lowest_m: float) -> Surface:
     """The part of a convex solid above z = ``lowest_m``, closed there."""
-    points = surface.points_m[np.unique(surface.triangles)]
-    ends = surface.points_m[surface.edges]
-    below, above = (np.take_along_axis(ends, k[:, None, None], 1)[:, 0] for k in _by_height(ends))
-    crossing = (below[:, 2] < lowest_m) & (above[:, 2] > lowest_m)
-    share = (lowest_m - below[crossing, 2]) / (above[crossing, 2] - below[crossing, 2])
-    rim = below[crossing] + share[:, None] * (above[crossing] - below[crossing])
-    kept = np.concatenate([points[points[:, 2] >= lowest_m], rim])
-    hull = ConvexHull(kept)
-    outwards = np.einsum("ti,ti->t", _normals(kept, hull.simplices), hull.equations[:, :3]) > 0.0
-    triangles = np.where(outwards[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.intp)
-    return surface_of(Body("", kept, triangles, np.zeros((0, 2), np.intp)))
-
-
-def _by_height(ends: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    upper = np.argmax(ends[:, :, 2], axis=1)
-    return 1 - upper, upper
-
-
-def _normals(points: Array, triangles: NDArray[np.intp]) -> Array:
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    return np.cross(b - a, c - a)
+    trimesh, z = mesh_library("a cut"), np.array([0.0, 0.0, 1.0])
+    kept = trimesh.intersections.slice_faces_plane(surface.points_m, surface.triangles, z, lowest_m * z)[0]
+    return surface_of(trimesh.convex.convex_hull(kept))
 
 
 def solid_shape(surface: Surface, mounted: bool) -> Shape:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gripmon.model.records import Array
-from gripmon.teach.cad.files import Body
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 SHARP_RAD = 0.524
 """Angle between two triangles (30 degrees) above which they meet in a sharp edge.  Exports cut roundings finer: Open
@@ -29,7 +32,7 @@ class Surface:
     """``points_m`` (p, 3), ``triangles`` (t, 3) with unit ``normals`` (t, 3).  ``edges`` (e, 2) points, ``sides``
     (e, 2) their triangles, -1 where there is none; ``sharp`` (e,): an edge of the body, or its border.  ``patch`` (t,):
     number of the part that is connected without crossing a sharp edge.  ``alike`` (e,): whether its two triangles have
-    the same orientation.  ``lines`` (l, 2) edges without triangles.
+    the same orientation.
     """
 
     points_m: Array
@@ -40,7 +43,6 @@ class Surface:
     sharp: NDArray[np.bool_]
     alike: NDArray[np.bool_]
     patch: NDArray[np.intp]
-    lines: NDArray[np.intp]
 
     @property
     def border(self) -> NDArray[np.bool_]:
@@ -68,26 +70,26 @@ class Surface:
         return float(0.5 * np.ptp(height))
 
 
-def surface_of(body: Body) -> Surface:
+def surface_of(body: Trimesh) -> Surface:
     """A body's surface: its points merged, triangles without area left out; a solid turned inside out is corrected."""
-    body = welded(body)
-    a, b, c = np.moveaxis(body.points_m[body.triangles] - body.points_m.mean(axis=0), 1, 0)
+    points, triangles = welded(body)
+    a, b, c = np.moveaxis(points[triangles] - points.mean(axis=0), 1, 0)
     if np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0:
-        body = replace(body, triangles=body.triangles[:, ::-1])
-    corners = body.points_m[body.triangles]
+        triangles = triangles[:, ::-1]
+    corners = points[triangles]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(area, axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # Flat to the rounding of single precision: such a sliver has no reliable normal.
     kept = size > 2e-7 * longest * np.maximum(longest, 1e-3)
-    triangles, normals = body.triangles[kept], area[kept] / size[kept, None]
+    triangles, normals = triangles[kept], area[kept] / size[kept, None]
     edges, sides, alike = _neighbours(triangles)
     turn = np.einsum("ei,ei->e", normals[sides[:, 0]], normals[sides[:, 1]]) * np.where(alike, 1.0, -1.0)
     sharp = (sides[:, 1] < 0) | (turn < np.cos(SHARP_RAD))
     smooth = sides[~sharp]
     graph = coo_matrix((np.ones(len(smooth), np.int8), smooth.T), shape=(len(triangles),) * 2)
     patch = connected_components(graph, directed=False)[1].astype(np.intp) if len(triangles) else np.zeros(0, np.intp)
-    return Surface(body.points_m, triangles, normals, edges, sides, sharp, alike, patch, body.lines)
+    return Surface(points, triangles, normals, edges, sides, sharp, alike, patch)
 
 
 def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
@@ -113,22 +115,21 @@ def _neighbours(triangles: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[
     return np.column_stack([low[first], high[first]]), sides, alike | ~paired
 
 
-def welded(body: Body) -> Body:
-    """The body with coinciding points on borders merged."""
-    edges, sides, _ = _neighbours(body.triangles)
+def welded(body: Trimesh) -> tuple[Array, NDArray[np.intp]]:
+    """A body's points (p, 3) and triangles (t, 3), with coinciding points on borders merged."""
+    points, triangles = np.asarray(body.vertices, dtype=float), np.asarray(body.faces, dtype=np.intp)
+    edges, sides, _ = _neighbours(triangles)
     border = np.unique(edges[sides[:, 1] < 0])
-    if len(border) < 2:
-        return body
-    close = cKDTree(body.points_m[border]).query_pairs(WELD_M, output_type="ndarray")
+    close = cKDTree(points[border]).query_pairs(WELD_M, output_type="ndarray")
     if not len(close):
-        return body
-    count = len(body.points_m)
+        return points, triangles
+    count = len(points)
     graph = coo_matrix((np.ones(len(close), np.int8), border[close].T), shape=(count, count))
     _, label = connected_components(graph, directed=False)
     _, first, back = np.unique(label, return_index=True, return_inverse=True)
-    triangles, lines = back[body.triangles], back[body.lines]
+    triangles = back[triangles]
     whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    return Body(body.name, body.points_m[first], triangles[whole], lines)
+    return points[first], triangles[whole]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,10 @@ from scipy.spatial.transform import Rotation
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
-from gripmon.teach.cad.files import MESHES, Body, joined, mesh_library, read_mesh
+from gripmon.teach.cad.files import MESHES, ROUND, joined, mesh_library, read_mesh
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 
 class NoMeshError(InputError):
@@ -147,32 +151,32 @@ class Urdf:
         axis = axis / max(float(np.linalg.norm(axis)), 1e-30)
         return Joint(name, kind, parent, child, self._origin(part, where), axis, (low, high), follows)
 
-    def body(self, name: str) -> Body:
+    def body(self, name: str) -> Trimesh:
         """A link's geometry in its own frame.  A visual mesh that can't be read is replaced by the collision's, with a
         note: that may be coarser.
         """
         visual, collision = self._links[name].findall("visual"), self._links[name].findall("collision")
         try:
-            return joined([self._geometry(part, f"link '{name}'") for part in visual or collision], name)
+            return joined([self._geometry(part, f"link '{name}'") for part in visual or collision])
         except NoMeshError as error:
             if not (visual and collision):
                 raise
             try:
-                body = joined([self._geometry(part, f"link '{name}'") for part in collision], name)
+                body = joined([self._geometry(part, f"link '{name}'") for part in collision])
             except NoMeshError:
                 raise error from None
             self.notes.append(f"link '{name}': its collision mesh is used, which may be coarser; {error.wrong}")
             return body
 
-    def _geometry(self, part: ElementTree.Element, where: str) -> Body:
+    def _geometry(self, part: ElementTree.Element, where: str) -> Trimesh:
         geometry = part.find("geometry")
         shape = None if geometry is None else next(iter(geometry), None)
         if shape is None:
             raise self.refuse(where, "has no geometry; a mesh, box, cylinder or sphere")
         body = self._mesh(shape, where) if shape.tag == "mesh" else self._primitive(shape, where)
-        return body.moved(self._origin(part, where))
+        return body.apply_transform(self._origin(part, where))
 
-    def _mesh(self, shape: ElementTree.Element, where: str) -> Body:
+    def _mesh(self, shape: ElementTree.Element, where: str) -> Trimesh:
         name, scale = shape.get("filename", ""), self.numbers(shape, "scale", "1 1 1", where)
         path = self._find(name)
         if path is None:
@@ -181,7 +185,7 @@ class Urdf:
         if path.suffix.lower() not in MESHES:
             raise NoMeshError(f"{self.path}: {where}: its mesh is '{path.name}'; {', '.join(MESHES)}: convert it")
         try:
-            return read_mesh(path, "m", size=False).moved(np.diag([*scale, 1.0]))
+            return read_mesh(path, "m", size=False).apply_transform(np.diag([*scale, 1.0]))
         except InputError as error:
             raise NoMeshError(error.wrong) from None
 
@@ -194,16 +198,13 @@ class Urdf:
             tries += [folder / plain, *([folder.joinpath(*parts[1:])] if name.startswith("package://") else [])]
         return next((path for path in tries if path.is_file()), None)
 
-    def _primitive(self, shape: ElementTree.Element, where: str) -> Body:
+    def _primitive(self, shape: ElementTree.Element, where: str) -> Trimesh:
         creation = mesh_library(str(self.path)).creation
         if shape.tag == "box":
-            mesh = creation.box(extents=self.numbers(shape, "size", "", where))
-        elif shape.tag == "cylinder":
+            return creation.box(extents=self.numbers(shape, "size", "", where))
+        if shape.tag == "cylinder":
             radius, length = (float(self.numbers(shape, key, "", where, 1)[0]) for key in ("radius", "length"))
-            mesh = creation.cylinder(radius=radius, height=length, sections=96)
-        elif shape.tag == "sphere":
-            mesh = creation.icosphere(subdivisions=4, radius=float(self.numbers(shape, "radius", "", where, 1)[0]))
-        else:
-            raise self.refuse(where, f"has a <{shape.tag}>; a mesh, box, cylinder or sphere")
-        triangles = np.asarray(mesh.faces, dtype=np.intp)
-        return Body(shape.tag, np.asarray(mesh.vertices, dtype=float), triangles, np.zeros((0, 2), np.intp))
+            return creation.cylinder(radius=radius, height=length, sections=ROUND)
+        if shape.tag == "sphere":
+            return creation.icosphere(subdivisions=4, radius=float(self.numbers(shape, "radius", "", where, 1)[0]))
+        raise self.refuse(where, f"has a <{shape.tag}>; a mesh, box, cylinder or sphere")

@@ -1,10 +1,9 @@
 // The page of gripmon watch --web.  All texts of monitors go into text nodes: they come from the network.
 
 import { showMount } from "./mount.js";
-import { get, post } from "./server.js";
+import { $, element, get, post, setText } from "./page.js";
 
 const PERIOD_MS = 1000, PICTURE_MS = 10_000, MOUNT_MS = 500, OLD_S = 25;
-const $ = (selector, within = document) => within.querySelector(selector);
 const cards = new Map();   // by name and id: {root, card, picture, asked, seen, next}
 let hover = false, ended = false, last = 0;
 
@@ -12,15 +11,6 @@ const clock = (ns) => new Date(ns / 1e6).toLocaleTimeString();
 const mm = (metres, digits) => (metres === null ? "–" : (1e3 * metres).toFixed(digits));
 const keyOf = (card) => JSON.stringify([card.robot, card.camera, card.monitor_id]);
 const named = (card) => `${card.robot}/${card.camera}`;
-
-function setText(node, text) { if (node.textContent !== text) node.textContent = text; }
-
-function element(name, text, className = "") {
-  const node = document.createElement(name);
-  node.textContent = text;
-  node.className = className;
-  return node;
-}
 
 const visible = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) target.dataset.visible = isIntersecting;

@@ -3,9 +3,8 @@
 import { Corners } from "./history.js";
 import { Stage } from "./stage.js";
 import * as panel from "./panel.js";
-import { get, picture, post } from "./server.js";
+import { $, get, over, picture, post, sentence } from "./page.js";
 
-const $ = (selector) => document.querySelector(selector);
 const LIVE_MS = 200, AGAIN_MS = 1000, NUDGED_MS = 150;
 
 const corners = new Corners();
@@ -29,8 +28,8 @@ function wanted(name) {
 
 function shown(name) {
   const put = corners.current.get(name);
-  const seen = reply?.corners.find((corner) => corner.name === name);
-  const found = reply && !reply.refused;
+  const seen = reply?.snapped.corners.find((corner) => corner.name === name);
+  const found = reply && !reply.snapped.refused;
   if (put?.hand && !state.corners_only) {
     const away = found && seen.uv_px ? Math.hypot(put.at[0] - seen.uv_px[0], put.at[1] - seen.uv_px[1]) : null;
     return { name, at: put.at, state: "hand", away };
@@ -64,11 +63,11 @@ function tell() {
   if (!corners.current.size && missing > 0) {
     panel.status(`Drag ${state.needed} corners onto the fingertips; the others follow by themselves.`);
   } else if (!reply) panel.status("looking…");
-  else if (reply.refused) panel.status(`${reply.refused[0].toUpperCase()}${reply.refused.slice(1)}.`, missing > 0 ? "" : "warn");
+  else if (reply.snapped.refused) panel.status(sentence(reply.snapped.refused), missing > 0 ? "" : "warn");
   else {
-    const measured = reply.corners.filter((corner) => corner.uv_px).length;
-    const corners_ = reply.corners.length ? `${measured} of ${reply.corners.length} corners measured; ` : "";
-    const found = `${corners_}${Math.round(100 * reply.share)} % of the edges are inliers.`;
+    const { corners: all, share } = reply.snapped, measured = all.filter((corner) => corner.uv_px).length;
+    const corners_ = all.length ? `${measured} of ${all.length} corners measured; ` : "";
+    const found = `${corners_}${Math.round(100 * share)} % of the edges are inliers.`;
     panel.status(reply.reference ? found : `${found} ${reply.no_reference}`, reply.reference ? "good" : "warn");
   }
 }
@@ -213,7 +212,7 @@ async function save() {
 }
 
 async function done() {
-  try { await post("done", {}); ended = true; if (state.back) location.assign(state.back); else panel.over(); } catch (error) { panel.status(error.message, "bad"); }
+  try { await post("done", {}); ended = true; if (state.back) location.assign(state.back); else over("gripmon teach has ended; this page may be closed."); } catch (error) { panel.status(error.message, "bad"); }
 }
 
 function connect() {

@@ -1,26 +1,22 @@
 // How a camera must be moved to stand as at its reference: six bars, drawn into a node that keeps them.
 
+import { element, setText } from "./page.js";
+
 const LIMITS_SHOWN = 3;   // on each side of a bar's middle
 
-function element(name, className = "") {
-  const node = document.createElement(name);
-  node.className = className;
-  return node;
-}
+const named = (tag, name) => element(tag, "", { class: name });
 
 function bar() {
-  const row = element("div", "move"), track = element("span", "track");
-  track.append(element("i", "allowed"), element("i", "fill"));
-  row.append(element("span", "end"), track, element("span", "end"), element("b"));
+  const row = named("div", "move"), track = named("span", "track");
+  track.append(named("i", "allowed"), named("i", "fill"));
+  row.append(named("span", "end"), track, named("span", "end"), element("b"));
   return row;
 }
 
-const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
-
 export function showMount(root, mount) {
   if (!root.children.length) {
-    root.append(element("p", "target"), element("p", "first"), element("p", "off"), element("div", "moves"));
-    root.append(element("p", "directions"), element("p", "afterwards"));
+    root.append(named("p", "target"), named("p", "first"), named("p", "off"), named("div", "moves"));
+    root.append(named("p", "directions"), named("p", "afterwards"));
   }
   const [target, first, off, moves, directions, afterwards] = root.children, [head, ...rest] = mount.summary.split(": ");
   root.dataset.kind = mount.placed ? "good" : mount.known ? "warn" : "bad";

@@ -1,17 +1,11 @@
 // The panel beside the image: words and numbers only.
 
-const $ = (selector) => document.querySelector(selector);
+import { $, element, sentence } from "./page.js";
+
 const mm = (m) => (1e3 * m >= 0.0995 ? (1e3 * m).toFixed(2) : (1e3 * m).toFixed(3));
 const degrees = (rad) => ((180 / Math.PI) * rad).toFixed(3);
 
 const basename = (path) => path.split(/[\\/]/).pop();
-
-function element(tag, text = "", attributes = {}) {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-  return node;
-}
 
 export function status(text, kind = "") {
   $("#status").textContent = text;
@@ -54,7 +48,7 @@ export function pictures(list, live, chosen) {
 }
 
 export function corners(list, reply, selected, choose) {
-  const replies = new Map((reply?.corners ?? []).map((corner) => [corner.name, corner]));
+  const replies = new Map((reply?.snapped.corners ?? []).map((corner) => [corner.name, corner]));
   $("#corners").parentElement.hidden = !list.length; // round tips have none
   $("#corners tbody").replaceChildren(...list.map(({ name, state, away }) => {
     const row = element("tr", "", { "data-corner": name });
@@ -72,7 +66,7 @@ export function corners(list, reply, selected, choose) {
       agree.append(meter, ` ${Math.round(100 * corner.inliers)} %`);
       row.append(element("td", corner.sigma_px.toFixed(3)), agree);
     } else {
-      const text = reply && !reply.refused ? corner?.reason ?? "" : state === "put" ? "placed" : "not placed yet";
+      const text = reply && !reply.snapped.refused ? corner?.reason ?? "" : state === "put" ? "placed" : "not placed yet";
       row.append(element("td", text, { colspan: 2, class: state === "refused" ? "reason" : "quiet" }));
     }
     row.addEventListener("click", () => choose(name));
@@ -85,8 +79,8 @@ export function jaw(reply, given, state) {
   const note = $("#opening-note");
   note.classList.toggle("warn", !given);
   if (given) note.textContent = "";
-  else if (reply?.jaw_opening_m != null && !reply.refused) {
-    const seen = `${(1e3 * reply.jaw_opening_m).toFixed(2)} ± ${mm(reply.jaw_sigma_m)} mm`;
+  else if (reply && !reply.snapped.refused) {
+    const { jaw_opening_m: opening_m, jaw_sigma_m: sigma_m } = reply.snapped, seen = `${(1e3 * opening_m).toFixed(2)} ± ${mm(sigma_m)} mm`;
     note.textContent = `The image shows ${seen}, but it can hardly separate that from the distance: better use what the robot reports.`;
   } else note.textContent = "Better use what the robot reports than what the image shows.";
 }
@@ -102,7 +96,7 @@ export function expected(reply, state) {
     ["rotation ±", sigma.rotation_rad.map(degrees), "°"],
     ["smallest turn", drift.smallest.rotation_rad.map(degrees), "°"],
   ];
-  if (reference && !state.reference) rows.push(["reference ±", reference.sigma.slice(0, 3).map(mm), "mm"]);
+  if (reference && !state.reference) rows.push(["reference ±", [0, 7, 14].map((k) => mm(Math.sqrt(reference.covariance[k]))), "mm"]);
   const weakest = sigma.tcp_m.indexOf(Math.max(...sigma.tcp_m));
   $("#accuracy tbody").replaceChildren(...rows.map(([name, numbers, unit], k) => {
     const row = element("tr");
@@ -110,11 +104,11 @@ export function expected(reply, state) {
     row.append(element("td", name), ...cells, element("td", unit));
     return row;
   }));
-  $("#promise").textContent = `${values.promise[0].toUpperCase()}${values.promise.slice(1)}.`;
+  $("#promise").textContent = sentence(values.promise);
   $("#promise").classList.toggle("warn", !values.reachable);
   const delays = drift.delay_frames["0.0001"].map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `within ${frames} frames`}`);
   const notes = [`A step of the TCP by 0.1 mm is detected on average: ${delays.join(", ")}.`];
-  if (reference?.rival) notes.push("Another pose explains these corners as well: place one outside of their plane.");
+  if (reply.pose?.rival) notes.push("Another pose explains these corners as well: place one outside of their plane.");
   if (reference && !state.reference) notes.push("The reference comes from these corners; a plate (gripmon calibrate plane) measures it more accurately.");
   if (recalibration.reason) notes.push(`No new pose from corners later: ${recalibration.reason}.`);
   $("#expected-note").textContent = notes.join(" ");
@@ -134,11 +128,4 @@ export function saved(result, asking, state) {
   $("#saved").replaceChildren(...lines);
   $("#save").textContent = asking ? "Replace what is there" : state.corners_only ? "Save corners" : "Save";
   $("#save").className = asking ? "ask" : "main";
-}
-
-export function over() {
-  const page = element("div", "", { class: "over" });
-  page.append(element("h1", "Done."), element("p", "gripmon teach has ended; this page may be closed."));
-  for (const part of document.body.children) part.hidden = true;
-  document.body.append(page);
 }

@@ -1,10 +1,8 @@
 // One step at a time: its form and buttons, what the camera or the monitor shows, and the result.
 
 import { showMount } from "./mount.js";
-import { get, post } from "./server.js";
+import { $, element, get, over, post, setText, shape } from "./page.js";
 
-const $ = (selector) => document.querySelector(selector);
-const SVG = "http://www.w3.org/2000/svg";
 const QUIET_MS = 1000, LIVELY_MS = 250;
 const MARKS = { done: "✓", stale: "!", skipped: "–" };
 const NAMED = { ready: "", done: "", stale: "do this again", waits: "", skipped: "not needed" };
@@ -12,20 +10,6 @@ const READ = { ...NAMED, ready: "not done yet", done: "done" };
 const drawn = new Map(), lost = new Map();
 
 let state, chosen = null, refused = "", typed = {}, frame = { live: 0, monitor: 0 }, ended = false, timer = null;
-
-function element(tag, text = "", attributes = {}) {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-  return node;
-}
-
-function shape(tag, attributes, parent) {
-  const node = document.createElementNS(SVG, tag);
-  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-  parent.append(node);
-  return node;
-}
 
 // Nodes that are drawn again lose the focus, and a click that has begun: only what differs is, and the focus returns, once
 // it can: a button that is at work can't have it.
@@ -183,7 +167,7 @@ function status() {
 
 function showStatus() {
   const [text, kind] = status();
-  if ($("#status").textContent !== text) $("#status").textContent = text;
+  setText($("#status"), text);
   $("#status").dataset.kind = kind;
 }
 
@@ -196,13 +180,11 @@ function showCapture() {
   if (!$("#coverage").hidden) {
     const across = views.cells[0].length, cells = $("#cells"), tilts = $("#tilts");
     cells.setAttribute("viewBox", `0 0 ${across} ${views.cells.length}`);
-    cells.replaceChildren();
-    views.cells.forEach((row, v) => row.forEach((seen, u) => shape("rect", { x: u + 0.03, y: v + 0.03, width: 0.94, height: 0.94, class: seen ? "seen" : "" }, cells)));
-    tilts.replaceChildren();
-    for (const r of [20, 45]) shape("circle", { r, class: "ring" }, tilts);
-    shape("path", { d: "M-58 0H58M0-58V58" }, tilts);
-    const degrees = 180 / Math.PI;
-    for (const [x, y] of views.tilts) shape("circle", { cx: x * degrees, cy: y * degrees, r: 4, class: "tilt" }, tilts);
+    const cell = (seen, u, v) => shape("rect", { x: u + 0.03, y: v + 0.03, width: 0.94, height: 0.94, class: seen ? "seen" : "" });
+    cells.replaceChildren(...views.cells.flatMap((row, v) => row.map((seen, u) => cell(seen, u, v))));
+    const degrees = 180 / Math.PI, rings = [20, 45].map((r) => shape("circle", { r, class: "ring" }));
+    const tilted = views.tilts.map(([x, y]) => shape("circle", { cx: x * degrees, cy: y * degrees, r: 4, class: "tilt" }));
+    tilts.replaceChildren(...rings, shape("path", { d: "M-58 0H58M0-58V58" }), ...tilted);
     const wants = views.wants.map((text) => element("li", `still: ${text}`));
     $("#wants").replaceChildren(...(wants.length ? wants : [element("li", "enough to calibrate; more do no harm", { class: "enough" })]));
   }
@@ -294,10 +276,7 @@ async function refresh() {
 async function done() {
   try { await post("done", {}); } catch (error) { refused = error.message; show(); return; }
   ended = true;
-  const page = element("div", "", { class: "over" });
-  page.append(element("h1", "Done."), element("p", "gripmon setup has ended; this page may be closed. gripmon setup in the same folder continues."));
-  for (const part of document.body.children) part.hidden = true;
-  document.body.append(page);
+  over("gripmon setup has ended; this page may be closed. gripmon setup in the same folder continues.");
 }
 
 async function begin() {

@@ -1,12 +1,12 @@
 // The image with zoom and pan, and its overlay.  Pixel centres lie at whole coordinates.
 
-const SVG = "http://www.w3.org/2000/svg";
+import { shape } from "./page.js";
+
 const ENLARGED = 10, SIGMAS = 3, LARGEST = 64, CLOSE = 5, LOUPE = 8;
 
-function make(tag, attributes = {}, parent = null) {
-  const node = document.createElementNS(SVG, tag);
-  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-  parent?.append(node);
+function make(tag, attributes, parent) {
+  const node = shape(tag, attributes);
+  parent.append(node);
   return node;
 }
 
@@ -124,17 +124,18 @@ export class Stage {
   #drawLines() {
     this.lines.replaceChildren();
     if (!this.reply) return;
-    this.lines.setAttribute("class", this.reply.refused ? "rough" : "found");
-    const outlines = Object.values(this.reply.outlines_px).map((line) => this.#path(line)).join("");
+    const seen = this.reply.snapped;
+    this.lines.setAttribute("class", seen.refused ? "rough" : "found");
+    const outlines = Object.values(seen.outlines_px).map((line) => this.#path(line)).join("");
     make("path", { class: "outline", d: outlines }, this.lines);
-    const dots = this.reply.edge_points_px.map((at) => `${this.#path([at])}h0`).join("");
+    const dots = seen.edge_points_px.map((at) => `${this.#path([at])}h0`).join("");
     make("path", { class: "points", d: dots }, this.lines);
-    for (const corner of this.reply.corners) {
-      if (corner.covariance_px2) this.#ellipse(corner.uv_px, corner.covariance_px2);
+    for (const corner of seen.corners) {
+      if (corner.covariance_px) this.#ellipse(corner.uv_px, corner.covariance_px);
     }
   }
 
-  #ellipse(at, [uu, uv, vv]) {
+  #ellipse(at, [[uu, uv], [, vv]]) {
     const mean = (uu + vv) / 2, half = Math.hypot((uu - vv) / 2, uv);
     const [x, y] = this.toStage(at);
     const size = SIGMAS * ENLARGED * this.scale;
