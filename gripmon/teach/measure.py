@@ -63,9 +63,9 @@ class Taught:
 
     ``closure_px``: largest distance of the gripper from where it stands when the images are measured with what was
     taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
-    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``play`` (6,): standard
-    deviations of where one image has the gripper from another.  ``left_out``: the images that contradict the others, by
-    their numbers, and why.
+    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``play`` (6,):
+    standard deviations of where one image has the gripper from another.  ``left_out``: the images that contradict the
+    others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
