@@ -209,7 +209,7 @@ def _when(stamp_ns: int, digits: int = 1) -> Markup:
 
 
 def _day(stamp_ns: int) -> Markup:
-    return Markup("{} {}").format(date(stamp_ns), _when(stamp_ns, 0))
+    return Markup('<time datetime="{}">{}</time> {}').format(iso(stamp_ns), date(stamp_ns), _when(stamp_ns, 0))
 
 
 def _link(to: str, text: object) -> Markup:

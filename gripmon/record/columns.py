@@ -99,10 +99,6 @@ class Sender:
         flat = np.array([v for some in values for v in some], dtype=np.float64)
         self.frames(path, rows, rr.Scalars.columns(scalars=flat).partition([len(some) for some in values]))
 
-    def curve(self, path: str, rows: Sequence[Row], values: Sequence[float | None]) -> None:
-        """One curve; None leaves a gap in it."""
-        self.scalars(path, rows, [() if value is None else (value,) for value in values])
-
     def lines(self, path: str, names: Sequence[str] | str, colours: Sequence[Colour] | Colour, width: float) -> None:
         """Set names, colours and width of an entity's curves."""
         count = 1 if isinstance(names, str) else len(names)

@@ -7,7 +7,7 @@
     figure.layout.template = undefined;
     if (window.innerWidth < 600) {
       figure.layout.margin = { ...figure.layout.margin, l: 44, r: 6 };
-      figure.layout.xaxis.nticks = 4; // more of them would be turned, over the title
+      Object.assign(figure.layout.xaxis, { nticks: 3, tickangle: 0 }); // turned ones lie over the title
     }
     place.style.height = `${figure.layout.height}px`; // Plotly forgets its own when the window changes
     Plotly.newPlot(place, figure.data, figure.layout, config);
