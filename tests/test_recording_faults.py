@@ -34,7 +34,7 @@ from gripmon.model.geometry import make_transform, to_record
 from gripmon.model.records import ReferenceRecord
 from gripmon.record.container import whole_bytes
 from gripmon.record.files import FileSeries
-from gripmon.record.recorder import Events, Row
+from gripmon.record.recorder import Row
 from gripmon.record.write import ProcessRecorder
 
 
@@ -182,7 +182,7 @@ def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(
     assert str(files.failure).startswith(f"recording failed: can't write {tmp_path / 'run-0001.rrd'} (")
     assert str(files.failure).endswith("MB free): No space left on device")
     assert (files.frames_written, files.frames_lost, files.path) == (10, 10, None)
-    files.add_events(Events(alerts=[alert_record(text="recording failed: no space")]))
+    files.add_events([alert_record(text="recording failed: no space")])
     write(20)
     assert (files.frames_lost, sorted(path.name for path in tmp_path.iterdir())) == (20, ["run-0001.rrd"]), "no room"
     room[0] = 10**9

@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 
 from gripmon.model.camera import LensSettings
+from gripmon.model.outputs import Event
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -22,7 +23,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.record.recorder import Events, Row
+from gripmon.record.recorder import Row, those
 
 APPLICATION_ID = "gripmon"
 RECORDED, REPLAYED = "recorded", "replayed"
@@ -140,20 +141,20 @@ class EventWriter:
         """Write state and verdict again with the next frame, changed or not."""
         self._state = self._verdict = ""
 
-    def write(self, rows: Sequence[Row], events: Events, more: Sequence[Line] = ()) -> None:
+    def write(self, rows: Sequence[Row], events: Sequence[Event], more: Sequence[Line] = ()) -> None:
         """``more``: further lines for the log."""
         if rows:
             self._newest_stamp_ns = rows[-1].record.stamp_ns
         lines = [*more, *self._status(rows)]
-        lines += [_of_alert(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in events.alerts]
-        lines += [_of_command(self._on_frames_clock(c.stamp_ns), c) for c in events.commands]
+        lines += [_of_alert(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in those(AlertRecord, events)]
+        lines += [_of_command(self._on_frames_clock(c.stamp_ns), c) for c in those(RecordedCommand, events)]
         if lines:
             columns = rr.TextLog.columns(text=[f"{self._whose}{e.text}" for e in lines], level=[e.level for e in lines])
             self._send.columns("events", [e.stamp_ns for e in lines], [e.seq for e in lines], columns)
-        self._whole("alert", events.alerts)
-        self._whole("command", events.commands)
-        self._whole("state", events.states)
-        for state in events.states:
+        self._whole("alert", those(AlertRecord, events))
+        self._whole("command", those(RecordedCommand, events))
+        self._whole("state", states := those(StateRecord, events))
+        for state in states:
             # Without frames only the daemon knows the state.
             if state.state is State.STALE and self._newest_stamp_ns is not None:
                 self._change(self._on_frames_clock(state.stamp_ns), state.seq, state.state, state.verdict)

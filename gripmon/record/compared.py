@@ -12,7 +12,7 @@ import rerun as rr
 
 from gripmon.record.columns import APPLICATION_ID, RECORDED, REPLAYED, EventWriter, Palette, Sender, faded
 from gripmon.record.curves import CurveWriter
-from gripmon.record.recorder import Events, Row, Then
+from gripmon.record.recorder import Row, Then
 
 _LOOKS = (
     (REPLAYED, "", 255, 1.5),
@@ -40,7 +40,7 @@ class ThenWriter:
         newest = rows[-1].record.seq
         commands = [command for command in self._commands if command.seq <= newest]
         self._commands = [command for command in self._commands if command.seq > newest]
-        self._status.write(then, Events(commands=commands))
+        self._status.write(then, commands)
 
     def finish(self) -> None:
         """Called when nothing more is written."""

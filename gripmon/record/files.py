@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gripmon.model.outputs import Event
+from gripmon.model.records import AlertRecord
 from gripmon.record.keeping import (
     PIN_SUFFIX,
     DiskBudget,
@@ -21,7 +23,7 @@ from gripmon.record.keeping import (
     pin_path,
     space_missing,
 )
-from gripmon.record.recorder import Events, Row, Scene
+from gripmon.record.recorder import Row, Scene, those
 from gripmon.record.taking import FileInbox, Load
 
 if TYPE_CHECKING:
@@ -74,13 +76,13 @@ class FileSeries(FileInbox):
         self._file: WrittenFile | None = None
         self._stream: rr.RecordingStream | None = None
         self._layout: bytes | None = None
-        self._unsaid: Events = Events()  # of the time without a file
+        self._unsaid: list[Event] = []  # of the time without a file
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
 
     def write(self) -> None:
         """Write what has been added to disk; begin, end or change the file as needed."""
         load = self._taken()
-        load.events, self._unsaid = self._unsaid + load.events, Events()
+        load.events, self._unsaid = self._unsaid + load.events, []
         for alert, stamp_ns in load.pins:
             self._pin(alert, stamp_ns)
         try:
@@ -113,7 +115,7 @@ class FileSeries(FileInbox):
         file.cover([row.record.stamp_ns for row in rows])
         self.frames_written += len(rows)
         del load.rows[: len(rows)]
-        load.events = Events()
+        load.events = []
         while load.late and not load.rows:
             file.writer.write_pictures(load.late[:_PICTURES_A_CHUNK])
             file.flush()
@@ -237,7 +239,7 @@ class FileSeries(FileInbox):
         """Count what could not be written but keep alerts, so that the next file says what happened."""
         self.frames_lost += len(load.rows)
         self.images_lost += len(load.late)
-        self._unsaid = Events(alerts=load.events.alerts[-_ALERTS_KEPT:])
+        self._unsaid = [*those(AlertRecord, load.events)[-_ALERTS_KEPT:]]
 
     @contextlib.contextmanager
     def _asking_disk(self) -> Iterator[None]:

@@ -8,7 +8,8 @@ ever blocks the interpreter in which the loop runs.  The daemon itself never imp
 from __future__ import annotations
 
 import uuid
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -213,36 +214,11 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
         return 0 if self.picture is None else len(self.picture.blob)
 
 
-class Events(msgspec.Struct, frozen=True, array_like=True):
-    """Events beside the frames: alerts that are in no frame's record, references, commands, state messages."""
-
-    alerts: list[AlertRecord] = []
-    references: list[ReferenceRecord] = []
-    commands: list[RecordedCommand] = []
-    states: list[StateRecord] = []
-
-    @staticmethod
-    def of(event: Event) -> Events:
-        """One event."""
-        if isinstance(event, AlertRecord):
-            return Events(alerts=[event])
-        if isinstance(event, ReferenceRecord):
-            return Events(references=[event])
-        return Events(commands=[event]) if isinstance(event, RecordedCommand) else Events(states=[event])
-
-    def __bool__(self) -> bool:
-        return any(msgspec.structs.astuple(self))
-
-    def __add__(self, later: Events) -> Events:
-        both = zip(msgspec.structs.astuple(self), msgspec.structs.astuple(later), strict=True)
-        return Events(*(a + b for a, b in both))
-
-
 class Batch(msgspec.Struct, frozen=True, array_like=True):
     """One message over the pipe."""
 
     rows: list[Row]
-    events: Events
+    events: list[Event]
 
 
 class Status(msgspec.Struct, frozen=True):
@@ -260,6 +236,14 @@ class Status(msgspec.Struct, frozen=True):
     notice: str | None = None  # advice about earlier files
     images_lost: int = 0  # around alerts, or because of a failed disk; the sender counts dropped images that were due
     hangs: bool = False  # the disk doesn't answer
+
+
+Kind = TypeVar("Kind", AlertRecord, RecordedCommand, ReferenceRecord, StateRecord)
+
+
+def those(kind: type[Kind], events: Sequence[Event]) -> list[Kind]:
+    """The events of a kind."""
+    return [event for event in events if isinstance(event, kind)]
 
 
 def pack_trace(trace: MeasurementTrace) -> TraceNote:

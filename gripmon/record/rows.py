@@ -27,12 +27,13 @@ import msgspec
 import rerun as rr
 
 from gripmon.model.gripper import Gripper
+from gripmon.model.outputs import Event
 from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 from gripmon.record.columns import EventWriter, Line, Sender
 from gripmon.record.compared import ThenWriter
 from gripmon.record.curves import CurveWriter
 from gripmon.record.overlay import OverlayWriter
-from gripmon.record.recorder import Events, RecordingSettings, Row, Scene
+from gripmon.record.recorder import RecordingSettings, Row, Scene, those
 from gripmon.record.rig import RigWriter
 
 
@@ -60,15 +61,15 @@ class RowWriter:
         self._references: list[ReferenceRecord] = []
         self._begun = False
 
-    def write(self, rows: Sequence[Row], events: Events) -> None:
+    def write(self, rows: Sequence[Row], events: Sequence[Event]) -> None:
         """Send everything since the last call.
 
         References wait for the first frame that names them: their own stamp may be long before the recording, or unset.
         One that the recording begins with holds from its first frame.
         """
-        for reference in events.references:
+        for reference in those(ReferenceRecord, events):
             self._curves.add_reference(reference)
-        self._references += events.references
+            self._references.append(reference)
         lines: list[Line] = []
         if rows:
             lines = self._write_references([row.record for row in rows])

@@ -18,11 +18,12 @@ from multiprocessing.connection import Connection
 import msgspec
 from msgspec.structs import replace
 
+from gripmon.model.outputs import Event
 from gripmon.model.records import Alert, AlertRecord, ReferenceRecord
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.keeping import Moments, PinnedBy, Trigger, pinned_by
 from gripmon.record.pictures import PictureRing, encode_picture
-from gripmon.record.recorder import Batch, Events, RecordingSettings, Row, Status
+from gripmon.record.recorder import Batch, RecordingSettings, Row, Status, those
 
 _BEAT_PERIOD_S = 0.5  # longest time between two reports to the daemon
 _ROWS_AT_ONCE = 128
@@ -42,7 +43,7 @@ class Load:
 
     rows: list[Row] = field(default_factory=list)
     late: list[Row] = field(default_factory=list)
-    events: Events = field(default_factory=Events)
+    events: list[Event] = field(default_factory=list)
     pins: list[tuple[PinnedBy, int | None]] = field(default_factory=list)
 
     @property
@@ -73,7 +74,7 @@ class Inbox:
             self._load.late += rows
             self._bound(self._load)
 
-    def add_events(self, events: Events) -> None:
+    def add_events(self, events: Sequence[Event]) -> None:
         with self._changed:
             self._load.events += events
 
@@ -108,14 +109,13 @@ class Inbox:
     def _taken(self) -> Load:
         with self._changed:
             load, self._load = self._load, Load()
-        if load.events.references:
-            self._reference = load.events.references[-1]
+        self._reference = [self._reference, *those(ReferenceRecord, load.events)][-1]
         return load
 
-    def _with_reference(self, events: Events) -> Events:
+    def _with_reference(self, events: list[Event]) -> list[Event]:
         """What a stream begins with, and a live one repeats: the reference in force before all else."""
         known = self._reference
-        return events if known is None or known in events.references else Events(references=[known]) + events
+        return events if known is None or known in events else [known, *events]
 
     def _much_waits(self) -> bool:
         many = len(self._load.rows) >= _ROWS_AT_ONCE
@@ -249,7 +249,7 @@ class Taker:
         for inbox in self._inboxes:
             inbox.add_events(batch.events)
         rows = [self._row(row) for row in batch.rows]
-        for alert in batch.events.alerts:
+        for alert in those(AlertRecord, batch.events):
             # Its own stamp may be from another clock than that of the frames.
             self._on_alert(alert, alert.seq, alert.stamp_ns, self._newest_ns)
         late, self._late = self._late, []

@@ -30,13 +30,13 @@ from gripmon.model.shared_images import ImagePlace, SharedImages
 from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
 from gripmon.record.process import Worker
 from gripmon.record.recorder import (
-    Events,
     Recorder,
     RecordingSettings,
     Scene,
     Status,
     Then,
     ViewSettings,
+    those,
 )
 from gripmon.record.waiting import Beside, Waiting, WaitingFrames
 
@@ -75,7 +75,7 @@ class ProcessRecorder(Recorder):
         # Filled by the loop's thread, emptied by the hand-over thread.
         self._frames = WaitingFrames(settings, beside)
         self._newest_record: FrameRecord | None = None
-        self._events: deque[Events] = deque(maxlen=_EVENTS_KEPT)
+        self._events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
         self._images_without_slot = self._images_lost_earlier = 0
         self._losses_logged, self._losses_logged_s = (0, 0), -math.inf
@@ -147,7 +147,7 @@ class ProcessRecorder(Recorder):
     def event(self, event: Event) -> None:
         """Record what is neither in the scene nor in a frame's record."""
         if not (isinstance(event, AlertRecord) and self._is_in_record(event)) and event != self._scene.reference:
-            self._events.append(Events.of(event))
+            self._events.append(event)
 
     def _is_in_record(self, alert: AlertRecord) -> bool:
         """Whether it is one of the newest frame's own alerts, to whose text the loop may have added."""
@@ -261,12 +261,11 @@ class ProcessRecorder(Recorder):
         _log.error("recording failed: %s; next try in %.0f s", failure, self._restart_pause_s)
         self._restart_pause_s = min(2.0 * self._restart_pause_s, LONGEST_RESTART_PAUSE_S)
 
-    def _next_events(self) -> Events:
-        events = Events()
+    def _next_events(self) -> list[Event]:
+        events: list[Event] = []
         while self._events:
-            events += self._events.popleft()
-        if events.references:
-            self._newest_reference = events.references[-1]
+            events.append(self._events.popleft())
+        self._newest_reference = [self._newest_reference, *those(ReferenceRecord, events)][-1]
         return events
 
     def _next_frames(self, worker: Worker) -> list[msgspec.Raw]:

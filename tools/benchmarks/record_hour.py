@@ -22,7 +22,7 @@ from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.files import FileSeries
 from gripmon.record.pictures import encode_picture
-from gripmon.record.recorder import Events, Row, Scene, pack_trace
+from gripmon.record.recorder import Row, Scene, pack_trace
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),
@@ -128,7 +128,7 @@ def _write(described: Scene, rows: Iterator[Row], plan: Plan) -> int:
     while batch := list(itertools.islice(rows, chunk)):
         series.add_frames(batch)
         if written % round(scene.FPS) < chunk:
-            series.add_events(Events(states=[_state(described, batch[-1])]))
+            series.add_events([_state(described, batch[-1])])
         series.write()
         written += len(batch)
         images += sum(row.picture is not None for row in batch)
