@@ -88,6 +88,28 @@ def test_where_the_tcp_was_at_the_end_is_not_mixed_with_where_it_was_before(kept
     assert "moved back" not in recording.summary and "displaced: when last measured" in recording.summary
 
 
+@pytest.mark.parametrize("dropped", [False, True], ids=["unmeasured", "missing"])
+def test_a_step_in_a_gap_affects_what_was_done_in_the_gap(dropped: bool):
+    """It was said to affect the frames behind the gap alone."""
+    shifts_m = np.zeros((500, 3))
+    shifts_m[200:260] = np.nan
+    shifts_m[260:] = (2e-3, 0.0, 0.0)
+    run = records(shifts_m)
+    said(run, 262)
+    recording = only(Run(run[:200] + run[260:] if dropped else run))
+    (old,) = [each for each in recording.affected if each.what == "old_calibration"]
+    assert old.start_ns == START_NS + 200 * PERIOD_NS and old.limit_ns == START_NS + 260 * PERIOD_NS
+    assert "Between 22:13:23.9 and 22:13:25.2 it moved at once" in recording.summary
+    assert "is affected from 22:13:24.0 " in recording.summary
+
+
+def test_what_was_not_seen_to_the_end_is_not_said_to_have_stood_still():
+    shifts_m = np.zeros((500, 3))
+    shifts_m[250:] = np.nan
+    summary = only(Run(records(shifts_m))).summary
+    assert "UTC) until it was last measured, at 22:13:24.9: no motion was reported in 5.0 s." in summary
+
+
 def test_a_creep_begins_where_it_left_its_noise_and_lasts_until_it_rests():
     t = np.arange(1000) / FPS
     shifts_m = np.zeros((1000, 3))

@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from gripmon.analyse.content import AffectedRange, Displacement, Event, Integrity, Limits
+from gripmon.analyse.content import AffectedRange, Displacement, Event, Integrity, Limits, Onset
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS, Track, displacement
 from gripmon.analyse.words import COVERAGE
@@ -44,6 +44,7 @@ def motion_ranges(track: Track, events: Sequence[Event], limits: Limits) -> list
     kinds = [("old_calibration", track.against_first, np.zeros(len(track), np.int64))]
     if len(track.keys) > 1:
         kinds.append(("stale_reference", track.against_reference, track.reference))
+    frame_ns = int(np.median(np.diff(track.stamp_ns))) if len(track) > 1 else 0
     begun_ns = min((event.onset.stamp_ns for event in motions), default=np.iinfo(np.int64).max)
     out: list[AffectedRange] = []
     for what, vectors, reference in kinds:
@@ -51,7 +52,7 @@ def motion_ranges(track: Track, events: Sequence[Event], limits: Limits) -> list
         for first, last in _past(track, vectors, limits, reference, track.stamp_ns >= begun_ns):
             limit_ns = int(track.stamp_ns[first])
             causes_ns = [
-                event.onset.stamp_ns
+                _as_early_as(event.onset, frame_ns)
                 for event in motions
                 if event.onset.stamp_ns <= limit_ns <= (event.end_ns or limit_ns) + SECOND_NS
             ]
@@ -68,6 +69,11 @@ def motion_ranges(track: Track, events: Sequence[Event], limits: Limits) -> list
             )
             before_ns = out[-1].end_ns
     return out
+
+
+def _as_early_as(onset: Onset, frame_ns: int) -> int:
+    """When a motion may have begun: where frames are missing, or nothing was measured, from the first of these on."""
+    return min(onset.stamp_ns, onset.earliest_ns + frame_ns) if onset.found_by == "hindsight" else onset.stamp_ns
 
 
 def verdict_ranges(track: Track, table: FrameTable) -> list[AffectedRange]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from gripmon.analyse.affected import excess
 from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
 from gripmon.analyse.events import MOTIONS
+from gripmon.analyse.track import SECOND_NS
 from gripmon.analyse.words import (
     clock_time,
     count,
@@ -115,7 +116,9 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
             return f"Whether t{who} moved isn't known: in no frame ({when}) could it be measured."
         if any(a.what == "old_calibration" for a in report.affected):
             return f"No motion of t{who} was reported ({when}), yet it was not always where its calibration has it."
-        return f"T{who} did not move ({when}): no motion was reported in {span(report.start_ns, report.end_ns)}."
+        last_ns = report.last_measured_ns
+        until = "" if report.end_ns - last_ns <= SECOND_NS else f" until it was last measured, at {clock_time(last_ns)}"
+        return f"T{who} did not move ({when}){until}: no motion was reported in {span(report.start_ns, last_ns)}."
     shown = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MAX_SHOWN]
     shown.sort(key=lambda e: e.onset.stamp_ns)
     largest = " The largest:" if len(shown) < len(motions) else ""
@@ -127,9 +130,11 @@ def _motion(event: Event, first: bool) -> str:
     how = {AlertKind.STEP: "it moved at once", AlertKind.CREEP: "it began to creep"}.get(
         AlertKind(event.kind), "it began to drift"
     )
-    uncertain_s = 1e-9 * (event.onset.latest_ns - event.onset.earliest_ns)
-    give_or_take = f" (within {duration(uncertain_s)})" if uncertain_s > 0.5 else ""
-    start = f"{'At' if first else 'Then, at'} {clock_time(event.onset.stamp_ns)}{give_or_take} {how}"
+    onset = event.onset
+    when = f"at {clock_time(onset.stamp_ns)}"
+    if onset.latest_ns - onset.earliest_ns > SECOND_NS // 2:
+        when = f"between {clock_time(onset.earliest_ns)} and {clock_time(onset.latest_ns)}"
+    start = f"{when.capitalize() if first else f'Then, {when}'} {how}"
     by = f", the TCP by {size(event.moved)}" if event.moved else ""
     within = f", most of it within {duration(event.moved_in_s)}" if event.moved_in_s else ""
     return f"{start}{by}{within}: {cause_words(event)}."
@@ -142,8 +147,7 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     last = "" if report.last_measured_ns is None else clock_time(report.last_measured_ns)
     measured = f"when last measured, at {last}"
     if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
-        near = millimetres(off.size_m, off.sigma_m)
-        return f"It has moved back: {measured}, the camera was where it began, to within {near}."
+        return f"It has moved back: {measured}, the TCP was {millimetres(off.size_m, off.sigma_m)} from where it began."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad, off.rotation_sigma_rad)}"
     still = "still " if motions else ""
     text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
