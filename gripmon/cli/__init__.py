@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon import __version__
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.images import LARGEST_PIXELS
 from gripmon.model.stopping import EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ _ENVIRONMENT = {
     # We report missing cameras and files that aren't videos ourselves.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    # A file of 1 MB may hold gigabytes of one colour.
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(LARGEST_PIXELS),
     # rerun reads this at import; we report full disks and damaged files ourselves.
     "RUST_LOG": "off",
 }
