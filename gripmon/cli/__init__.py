@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon import __version__
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.images import LARGEST_PIXELS
 from gripmon.model.stopping import EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ _ENVIRONMENT = {
     # We report missing cameras and files that aren't videos ourselves.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
-    # A file of 1 MB may hold gigabytes of one colour.
-    "OPENCV_IO_MAX_IMAGE_PIXELS": str(LARGEST_PIXELS),
+    # A file of 1 MB may hold gigabytes of one colour; 12,000 x 12,000 px of 16-bit colour are 0.8 GiB.
+    "OPENCV_IO_MAX_IMAGE_PIXELS": "144000000",
     # rerun reads this at import; we report full disks and damaged files ourselves.
     "RUST_LOG": "off",
 }

@@ -25,8 +25,6 @@ LARGEST_BYTES = 1 << 30
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 """First bytes of such a file."""
 NOT_AN_IMAGE = "truncated, damaged or not an image"
-LARGEST_PIXELS = 12_000 * 12_000
-"""OpenCV's limit in our commands: a small file may hold gigabytes of one colour (pixels)."""
 _TOO_LARGE = "CV_IO_MAX_IMAGE_PIXELS"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _BIG_TIFF, _ORIENTATION, _MOST_TAGS = 43, 274, 4096
@@ -160,7 +158,7 @@ def decoded(data: bytes, flags: int) -> tuple[Image | None, str | None]:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         if _TOO_LARGE in str(error.err):
-            return None, f"an image of more than {LARGEST_PIXELS / 1e6:g} million pixels; a camera's"
+            return None, f"an image of more pixels than OPEN{_TOO_LARGE}"
         return None, NOT_AN_IMAGE
     return image, None if image is not None else NOT_AN_IMAGE
 
