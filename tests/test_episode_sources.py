@@ -7,13 +7,26 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from support.episode_files import NS, WRIST, Shots, write_foxglove, write_lerobot, write_mcap, write_rosbag2
+from support.episode_files import (
+    NS,
+    WRIST,
+    Shots,
+    encoded,
+    write_foxglove,
+    write_lerobot,
+    write_mcap,
+    write_ros1,
+    write_rosbag2,
+)
 
 import gripmon
-from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, open_source, settings_for_path
+from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, bags, open_source, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.io.sources.episodes import find_episodes
 from gripmon.model.camera import BrownConradyLens
@@ -70,6 +83,89 @@ def test_messages_of_ros(tmp_path: Path, write, raw: bool):
     assert_as_written(frames, written)
     assert [frame.stamp_ns for frame in frames] == written.stamps_ns
     assert source.camera == LENS
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("mcap", [False, True])
+def test_messages_of_ros_1(tmp_path: Path, mcap: bool, raw: bool):
+    path, written = tmp_path / ("a.mcap" if mcap else "a.bag"), shots()
+    write_ros1(path, written, mcap=mcap, raw=raw)
+    assert settings_for_path(path) == BagSettings(path=str(path))
+    assert [episode.name for episode in find_episodes(str(tmp_path))] == [path.name]
+    source = BagSource(BagSettings(path=str(path), opening=FINGERS))
+    frames = list(iter(source.read, None))
+    assert_as_written(frames, written)
+    assert [frame.stamp_ns for frame in frames] == written.stamps_ns
+    assert source.camera == LENS
+
+
+def test_types_that_only_the_bag_defines(tmp_path: Path):
+    """Foxglove's, as CDR in SQLite, to a process that has read no other bag."""
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    name, store = "foxglove_msgs/msg/CompressedImage", get_typestore(Stores.ROS2_JAZZY)
+    text = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    store.register(get_types_from_msg(text, name))
+    written = shots(3)
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/wrist/image", name, typestore=store)
+        for image, stamp_ns in zip(written.images, written.stamps_ns, strict=True):
+            stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NS))
+            message = store.types[name](stamp, "wrist", cv2.imencode(".png", image)[1].ravel(), "png")
+            writer.write(connection, stamp_ns, store.serialize_cdr(message, name))
+    bags._types.cache_clear()
+    assert_as_written(frames_of(BagSettings(path=str(tmp_path / "bag"))), written, openings=False)
+
+
+def compressed(data: bytes, said: str):
+    """A change of messages: that content, under that format."""
+
+    def change(message):
+        if hasattr(message, "format"):
+            message.format, message.data = said, np.frombuffer(data, np.uint8)
+        return message
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (bytes(12) + cv2.imencode(".png", np.zeros((48, 64), np.uint16))[1].tobytes(), "16UC1; compressedDepth png"),
+        (b"\x80theora", "theora"),
+        (b"", "jpeg"),
+    ],
+)
+def test_what_is_no_picture_is_said_by_its_format(tmp_path: Path, data: bytes, said: str):
+    write_mcap(tmp_path / "a.mcap", shots(2), compressed(data, said))
+    frames = frames_of(BagSettings(path=str(tmp_path / "a.mcap")))
+    words = f"truncated, damaged or not an image: format '{said}'; JPEG, PNG, WebP or h264, h265, hevc, vp9, av1"
+    assert [frame.fault for frame in frames] == [words] * 2
+
+
+def test_a_compressed_mosaic_and_h264_in_a_message_of_ros(tmp_path: Path):
+    mosaic = np.tile(np.array([[40, 120], [120, 200]], np.uint8), (24, 32))  # red, green; green, blue
+    write_mcap(
+        tmp_path / "a.mcap", shots(1),
+        compressed(cv2.imencode(".png", mosaic)[1].tobytes(), "bayer_rggb8; png compressed "),
+    )  # fmt: skip
+    (frame,) = frames_of(BagSettings(path=str(tmp_path / "a.mcap")))
+    np.testing.assert_array_equal(frame.image[4:-4, 4:-4], np.full((40, 56, 3), [200, 120, 40]))
+    written = shots()
+    packets = iter(encoded(written.images, "libx264"))
+    write_mcap(
+        tmp_path / "b.mcap", written,
+        lambda message: compressed(next(packets), "h264")(message) if hasattr(message, "format") else message,
+    )  # fmt: skip
+    assert_as_written(frames_of(BagSettings(path=str(tmp_path / "b.mcap"))), written, openings=False, lossy_dn=2.0)
+
+
+def test_a_bag_without_images_names_its_topics(tmp_path: Path):
+    write_mcap(tmp_path / "a.mcap", shots(1), kinds=("CameraInfo", "JointState"))
+    words = r"no topic with images \(Image, .*\); its topics: /joint_states .*, /wrist/camera_info \(.*/CameraInfo\)"
+    with pytest.raises(SourceError, match=words):
+        open_source(BagSettings(path=str(tmp_path / "a.mcap")))
 
 
 @pytest.mark.parametrize("video", [False, True])
@@ -355,3 +451,26 @@ def test_replay_names_options_that_do_nothing(tmp_path: Path, capfd: pytest.Capt
     demo = str(builtin_config("demo.yaml"))
     assert main(["replay", str(tmp_path / "a.mcap"), "--config", demo, "--out", "-", "--episode", "1"]) == 2
     assert "a.mcap is one episode; leave it out" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "words"),
+    [
+        ("episode_index", ["0"] * 12, "can't be read .* no kernel matching .*; a whole table"),
+        ("timestamp", [None, *range(1, 12)], "time stamps that don't rise; seconds from its beginning"),
+        ("timestamp", [*range(11), None], "time stamps that don't rise; seconds from its beginning"),
+        ("timestamp", [i * 10**17 for i in range(12)], "seconds from its beginning"),
+        ("observation.state", [[0.3, float("nan")]] * 12, ""),
+    ],
+)
+def test_a_table_with_values_that_are_none(tmp_path: Path, column: str, values: list, words: str):
+    write_lerobot(tmp_path / "set", [shots()], fps=20, version="v2.1")
+    path = next((tmp_path / "set").glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, pa.array(values)), path)
+    settings = LeRobotSettings(path=str(tmp_path / "set"), opening=GRIPPER)
+    if not words:
+        assert [frame.jaw_opening_m for frame in frames_of(settings)] == [None] * 12
+        return
+    with pytest.raises(SourceError, match=words):
+        open_source(settings)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import struct
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -49,6 +53,29 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path):
     source.read()
     frame = source.read()
     assert frame is not None and frame.fault == "the file can't be read: it is larger than 1024 MiB"
+
+
+def test_a_small_file_of_very_many_pixels_is_not_decoded(tmp_path: Path):
+    """1.3 MB took 2.8 GB."""
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(1 + 6 * 15_000)) for _ in range(15_000)) + packer.flush()
+    header = struct.pack(">IIBBBBB", 15_000, 15_000, 16, 2, 0, 0, 0)
+    (tmp_path / "0.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b""))
+    ))  # fmt: skip
+    asked = "import sys, resource; from gripmon.cli import main; done = main(sys.argv[1:]); "
+    asked += "print(done, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)"
+    said = subprocess.run(
+        [
+            sys.executable, "-c", asked, "calibrate", "intrinsics", str(tmp_path / "0.png"),
+            "--target", "circles:8x8:0.008:0.004", "--out", str(tmp_path / "camera.yaml"),
+        ],
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    code, megabytes = map(int, said.stdout.split())
+    assert "0.png: an image of more pixels than OPENCV_IO_MAX_IMAGE_PIXELS; an image file" in said.stderr
+    assert code == 2 and megabytes < 400
 
 
 def test_a_table_that_is_a_pipe_is_refused(tmp_path: Path):

@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from gripmon.io.sources.payload import PayloadError, file_image
-from gripmon.io.sources.stored import decoded_file
-from gripmon.model.images import read_image
+from gripmon.model.images import grey_image, read_image
 from gripmon.model.jpeg import jpeg_end, jpeg_fault
 from gripmon.record.recordings import decode_image
 
@@ -68,12 +67,12 @@ def test_no_way_into_the_product_takes_a_truncated_one(tmp_path: Path, share: fl
     data = FILES["grey"]
     truncated = data[: int(share * len(data))] + padding
     (tmp_path / "a.jpg").write_bytes(truncated)
-    for image, fault in (read_image(tmp_path / "a.jpg"), decoded_file(truncated)):
+    for image, fault in (read_image(tmp_path / "a.jpg"), grey_image(truncated)):
         assert image is None and fault == "truncated or damaged: a JPEG without its end"
     assert decode_image(truncated) is None
     with pytest.raises(PayloadError, match=r"damaged JPEG file .*without its end"):
         file_image(truncated, (128, 96))
     whole = data + padding
     (tmp_path / "a.jpg").write_bytes(whole)
-    assert read_image(tmp_path / "a.jpg")[0] is not None and decoded_file(whole)[0] is not None
+    assert read_image(tmp_path / "a.jpg")[0] is not None and grey_image(whole)[0] is not None
     assert decode_image(whole) is not None and file_image(whole, (128, 96)).shape == (96, 128)

@@ -13,7 +13,7 @@ from support.sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError
-from gripmon.model.pixels import ENCODINGS
+from gripmon.model.pixels import ENCODINGS, without_mosaic
 
 
 def decoded(
@@ -40,9 +40,20 @@ def test_raw_pixels_of_every_encoding_are_what_they_were():
         "rgb8": (bgr[:, :, ::-1], bgr),
         "rgb16": (bgr16[:, :, ::-1].astype("<u2"), bgr16),
         "bgra8": (np.concatenate([bgr, alpha], axis=2), bgr),
+        "8UC3": (bgr, bgr),
+        "16UC3": (bgr16.astype("<u2"), bgr16),
+        "8UC4": (np.concatenate([bgr, alpha], axis=2), bgr),
+        "bgra16": (np.concatenate([bgr16, mono16[:, :, None]], axis=2).astype("<u2"), bgr16),
+        "16UC4": (np.concatenate([bgr16, mono16[:, :, None]], axis=2).astype("<u2"), bgr16),
+        "rgba16": (np.concatenate([bgr16[:, :, ::-1], mono16[:, :, None]], axis=2).astype("<u2"), bgr16),
         "rgba8": (np.concatenate([bgr[:, :, ::-1], alpha], axis=2), bgr),
         "yuv422_yuy2": (np.stack([luma, grey(3)], axis=2), of_luma),
+        "yuyv": (np.stack([luma, grey(3)], axis=2), of_luma),
         "yuv422": (np.stack([grey(3), luma], axis=2), of_luma),
+        "uyvy": (np.stack([grey(3), luma], axis=2), of_luma),
+        "nv12": (np.concatenate([luma, grey(3)[::2]]), of_luma),
+        "nv21": (np.concatenate([luma, grey(3)[::2]]), of_luma),
+        "nv24": (np.concatenate([luma, grey(3), grey(4)]), of_luma),
     }
     for encoding, (pixels, image) in expected.items():
         out = decoded(pixels.tobytes(), raw_note(encoding))
@@ -63,6 +74,18 @@ def test_a_bayer_mosaic_gives_its_colours(pattern: str, bits: int):
     scale = 1 if bits == 8 else 256
     expected = np.full((HEIGHT - 8, WIDTH - 8, 3), [200, 120, 40]) * scale
     np.testing.assert_array_equal(out[4:-4, 4:-4], expected)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_compressed_mosaic_gives_its_colours_unless_it_was_converted_before(bits: int):
+    """As ``compressed_image_transport`` says what it has compressed; the depth is the file's."""
+    mosaic = grey() if bits == 8 else grey().astype(np.uint16) * 257
+    shown = decoded(mosaic.tobytes(), raw_note(f"bayer_gbrg{bits}"))
+    for said in ("bayer_gbrg8; png compressed ", "bayer_gbrg16; jpeg compressed"):
+        np.testing.assert_array_equal(without_mosaic(mosaic, said), shown)
+    for said in ("bayer_gbrg8; jpeg compressed bgr8", "mono8; png compressed ", "png", "", "bayer_8; png compressed "):
+        assert without_mosaic(mosaic, said) is mosaic
+    assert without_mosaic(shown, "bayer_gbrg8; png compressed ") is shown
 
 
 def test_gaps_between_rows_are_left_out():

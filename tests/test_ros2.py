@@ -224,6 +224,10 @@ def test_what_a_topic_lacks_is_said_and_the_camera_waits_for_it():
             frame = sending(camera, publisher, image_message(GREY, 5), "an image")
             np.testing.assert_array_equal(frame.image, GREY)
             assert frame.stamp_ns == 5 and camera.connected
+            with other_node("twin") as twin:
+                twin.publisher(Image, "/eye/image")
+                wait_until(lambda: "/eye/image has 2 publishers, whose images" in camera.fault(), "the second one")
+            wait_until(lambda: "publishers" not in camera.fault(), "its end")
             info = CameraInfo(width=64, height=48, distortion_model="plumb_bob")
             info.k = np.array([60.0, 0.0, 39.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0])
             far = "/eye/info: the frames have a camera calibration that is up to 8 px from the configuration's"
@@ -286,6 +290,24 @@ def test_whatever_comes_is_an_image_or_refused_in_one_line():
                     camera._content(Arrival((kind, payload), 7, 0.0))
             else:
                 assert camera._content(Arrival((kind, payload), 7, 0.0)).stamp_ns == 5
+    finally:
+        camera.close()
+
+
+def test_what_drivers_send_beside_plain_pixels():
+    """Luma planes, and a mosaic in a file."""
+    from rclpy.serialization import serialize_message
+
+    camera = Ros2Camera(Ros2CameraSettings(image="/eye/image", domain_id=DOMAIN), SIZE_PX)
+    try:
+        planes = image_message(np.concatenate([GREY, GREY[::2]]), 5, encoding="nv21")
+        planes.height = 48
+        content = camera._content(Arrival((IMAGE, bytes(serialize_message(planes))), 7, 0.0))
+        assert content.image.shape == (48, 64)
+        mosaic = np.tile(np.array([[40, 120], [120, 200]], np.uint8), (24, 32))  # red, green; green, blue
+        file = file_message(cv2.imencode(".png", mosaic)[1].tobytes(), 5, "bayer_rggb8; png compressed ")
+        content = camera._content(Arrival((COMPRESSED_IMAGE, bytes(serialize_message(file))), 7, 0.0))
+        np.testing.assert_array_equal(content.image[4:-4, 4:-4], np.full((40, 56, 3), [200, 120, 40]))
     finally:
         camera.close()
 

@@ -10,6 +10,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from support.episode_files import write_video_at
 
 from gripmon.io.sources import (
     FolderSettings,
@@ -23,7 +24,7 @@ from gripmon.io.sources import (
     open_source,
     settings_for_path,
 )
-from gripmon.model.images import natural_key
+from gripmon.model.images import grey_image, natural_key, read_image
 from gripmon.model.records import Frame
 
 
@@ -178,6 +179,31 @@ def test_time_stamps_and_jaw_openings_from_the_table(tmp_path: Path):
     assert [f.jaw_opening_m for f in frames] == [None, 0.0, 0.034]
 
 
+@pytest.mark.parametrize(("step", "per"), [(33, "ms"), (33_333, "us")])
+def test_stamps_of_another_unit_are_refused(tmp_path: Path, step: int, per: str):
+    for i in range(4):
+        write(tmp_path, f"{i}.png", picture(i))
+    rows = "".join(f"{i}.png,{1_700_000_000 + i * step}\n" for i in range(4))
+    (tmp_path / "timestamps.csv").write_text(f"file,stamp_ns\n{rows}")
+    with pytest.raises(SourceError, match=rf"stamp_ns rises by {step} .* more than 10,000 frames/s; nanoseconds"):
+        FolderSource(FolderSettings(path=str(tmp_path)), Path())
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("turn", [2, 3, 6, 8])
+def test_pixels_of_a_tiff_are_as_the_sensor_has_them(tmp_path: Path, turn: int, big: bool):
+    """OpenCV turns a TIFF by its tag of orientation, whatever it is asked, and fails for some."""
+    from PIL import Image
+
+    image = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    Image.fromarray(image).save(tmp_path / "a.tif", tiffinfo={274: turn}, big_tiff=big)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0], image)
+    np.testing.assert_array_equal(grey_image((tmp_path / "a.tif").read_bytes())[0], image)
+    data = (tmp_path / "a.tif").read_bytes()
+    for cut in range(0, len(data), 7):  # whatever is left of it
+        grey_image(data[:cut])
+
+
 def test_a_listed_file_that_is_missing_is_a_fault(tmp_path: Path):
     write(tmp_path, "0.png", picture(0))
     (tmp_path / "timestamps.csv").write_text("file,stamp_ns\n0.png,5\n1.png,6\n")
@@ -299,7 +325,7 @@ def test_video_frames_without_a_stamp_or_picture_are_faults(tmp_path: Path):
     make_video(tmp_path / "a.avi")
     source = VideoSource(VideoSettings(path="a.avi"), tmp_path)
     source._capture.release()
-    source._capture = TornCapture()
+    source._capture, source._is_there = TornCapture(), False
     frames = read_all(source)
     assert [f.fault is None for f in frames] == [True, False, False, False]
     assert [f.stamp_ns for f in frames] == [0, 40_000_000, 40_000_000, 40_000_000]
@@ -313,7 +339,33 @@ def test_a_truncated_video_ends_early_and_says_so(tmp_path: Path, caplog: pytest
     (tmp_path / "a.avi").write_bytes(data[: len(data) // 2])
     frames = read_all(open_source(VideoSettings(path="a.avi"), tmp_path))
     assert 10 < len(frames) < 40
-    assert "of 60 frames" in caplog.text
+    assert "of 2.32 s; is it truncated?" in caplog.text  # when the last but one of 60 at 25 a second is due
+
+
+def test_a_whole_video_of_a_rate_that_varies_is_not_said_to_be_truncated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    """Matroska has no number of frames: OpenCV makes one of the length and the first frames' rate."""
+    times_s = np.cumsum([0.0, 0.04, 0.04, 0.04, *[0.2] * 8])
+    write_video_at(tmp_path / "a.mkv", [picture(i) for i in range(12)], times_s, "libx264")
+    frames = read_all(open_source(VideoSettings(path="a.mkv"), tmp_path))
+    np.testing.assert_allclose([f.stamp_ns for f in frames], 1e9 * times_s, atol=1e6)
+    assert not caplog.text
+
+
+def test_a_video_that_opencv_can_not_decode_is_read_by_pyav(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """AV1, as LeRobot's: opened, and then without a frame and without a word."""
+    times_s = 5.0 + np.arange(8) / 25.0
+    shades = [np.full((48, 64), 40 + 20 * i, np.uint8) for i in range(8)]
+    write_video_at(tmp_path / "a.mp4", shades, times_s, "libsvtav1")
+    frames = read_all(open_source(VideoSettings(path="a.mp4"), tmp_path))
+    assert [f.stamp_ns for f in frames] == [40_000_000 * i for i in range(8)]
+    for frame, shade in zip(frames, shades, strict=True):
+        assert frame.fault is None and frame.image is not None and frame.image.shape == (*shade.shape, 3)
+        assert np.abs(frame.image.mean(axis=2) - shade).mean() < 2.0
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(SourceError, match=r"OpenCV can't decode 'AV01', PyAV can \(.* package av; pip install"):
+        open_source(VideoSettings(path="a.mp4"), tmp_path)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no video at all" * 100])

@@ -30,6 +30,8 @@ _ENVIRONMENT = {
     # We report missing cameras and files that aren't videos ourselves.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    # A file of 1 MB may hold gigabytes of one colour; 12,000 x 12,000 px of 16-bit colour are 0.8 GiB.
+    "OPENCV_IO_MAX_IMAGE_PIXELS": "144000000",
     # rerun reads this at import; we report full disks and damaged files ourselves.
     "RUST_LOG": "off",
 }

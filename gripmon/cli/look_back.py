@@ -200,9 +200,9 @@ def view(arguments: Arguments) -> int:
 
 _REPLAY_OPTIONS = """
 INPUT...              a folder of images, in the order of their names, a video file, or a gripmon recording: an .rrd
-                      file, all files of one run, or a folder of them (searched recursively); an .mcap file, a rosbag2
-                      folder or a LeRobot dataset; a folder of images may contain a timestamps.csv with the columns
-                      file,stamp_ns[,jaw_opening_m] (Unix ns, m)
+                      file, all files of one run, or a folder of them (searched recursively); an .mcap or .bag file, a
+                      rosbag2 folder or a LeRobot dataset; a folder of images may contain a timestamps.csv with the
+                      columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)
 --config CONFIG       configuration (YAML); its source section is used only for the camera and opening of an .mcap, a
                       rosbag2 or a LeRobot dataset; without it a recording's own configuration is used
 --out FILE            file for the JSON lines; - is standard output
@@ -333,7 +333,7 @@ def dataset(arguments: Arguments) -> int:
     """Where was the wrist camera in each episode of a dataset?  For every episode and camera: cam_T_grip with
     its covariance and protection level, whether the camera moved within it (when, how far, why), which
     episodes share one mounting, and which fraction of the frames is usable.  DATASET is a folder or a URL
-    (s3://bucket/folder) with LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos,
+    (s3://bucket/folder) with LeRobot datasets, .mcap and .bag files, rosbag2 folders, folders of images or videos,
     and is never modified.  Below DIR:
 
       stretches/camera=NAME/part-0.parquet   a row for each stretch without motion, failures included

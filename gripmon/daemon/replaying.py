@@ -267,7 +267,7 @@ def _refuse_empty_folders(paths: Sequence[Path]) -> None:
         except OSError as error:
             raise InputError(f"{path}: can't be read ({error.strerror})") from None
         if not images:
-            right = ".rrd files, or images such as *.png, *.jpg, *.tif, *.pgm"
+            right = ".rrd files, or images such as *.png, *.jpg, *.tif, *.pgm; a video, .mcap or .bag by its own name"
             raise InputError(f"{path}: no recordings and no images in it; {right}")
 
 
@@ -280,7 +280,7 @@ def _open_input(
     warn: Callable[[str], None] = _log.warning,
 ) -> Source:
     if not path.exists():
-        right = "a folder of images, a video, an .mcap, a rosbag2, a LeRobot dataset or an .rrd"
+        right = "a folder of images, a video, an .mcap, a rosbag, a LeRobot dataset or an .rrd"
         raise InputError(f"{path}: there is no such file or folder; {right}")
     settings = settings_for_path(path, fps)
     if isinstance(settings, EpisodeSettings):

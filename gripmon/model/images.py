@@ -9,7 +9,7 @@ import re
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from gripmon.model.errors import InputError
 from gripmon.model.jpeg import jpeg_fault
@@ -24,6 +24,10 @@ LARGEST_BYTES = 1 << 30
 """Larger files are neither images nor tables: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 """First bytes of such a file."""
+NOT_AN_IMAGE = "truncated, damaged or not an image"
+_TOO_LARGE = "CV_IO_MAX_IMAGE_PIXELS"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_BIG_TIFF, _ORIENTATION, _MOST_TAGS = 43, 274, 4096
 _PNG_END = b"IEND"
 _PNG_END_BYTES = 8
 """Length of the last chunk's name and checksum (bytes)."""
@@ -119,21 +123,59 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
         return None, f"the file can't be read: {error.strerror}"
     if not data:
         return None, "the file is empty"
-    if data.startswith(PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
-        return None, "truncated, damaged or not an image"  # libpng would print its own message to stderr
-    if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
-        return None, fault
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        return None, f"not an image: {error.err}"
+    image, fault = decoded(data, cv2.IMREAD_UNCHANGED)
     if image is None:
-        return None, "truncated, damaged or not an image"
+        return None, fault
     if image.dtype == np.float64:
         image = image.astype(np.float32)
     if image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, 0] if image.shape[2] < 3 else image[:, :, :3])
     return image, None
+
+
+def grey_image(data: bytes) -> tuple[Image | None, str | None]:
+    """The brightness in a file's bytes, H x W (nothing else is measured), and None; or None and why there is none."""
+    import cv2
+
+    return decoded(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+
+
+def decoded(data: bytes, flags: int) -> tuple[Image | None, str | None]:
+    """What OpenCV reads in a file's bytes by its ``flags``, and None; or None and why there is nothing.
+
+    Pixels are as the sensor has them, whatever EXIF says of the way up: the lens is of the sensor.
+    """
+    import cv2
+    import numpy as np
+
+    if data.startswith(PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
+        return None, NOT_AN_IMAGE  # libpng would print its own message to stderr
+    if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
+        return None, fault
+    if data.startswith(_TIFF):
+        data = _not_turned(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        if _TOO_LARGE in str(error.err):
+            return None, f"an image of more pixels than OPEN{_TOO_LARGE}"
+        return None, NOT_AN_IMAGE
+    return image, None if image is not None else NOT_AN_IMAGE
+
+
+def _not_turned(tiff: bytes) -> bytes:
+    """A TIFF without its tag of orientation, which OpenCV obeys whatever it is told (TIFF 6.0, section 8; BigTIFF)."""
+    order: Literal["little", "big"] = "little" if tiff.startswith(b"II") else "big"
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(tiff[at : at + size], order)
+
+    at, wide, entry, value = (8, 8, 20, 12) if number(2, 2) == _BIG_TIFF else (4, 2, 12, 8)
+    at = number(at, 4)
+    for tag in range(at + wide, at + wide + entry * min(number(at, wide), _MOST_TAGS), entry):
+        if number(tag, 2) == _ORIENTATION:
+            return tiff[: tag + value] + (1).to_bytes(2, order) + tiff[tag + value + 2 :]
+    return tiff
 
 
 def regular_bytes(path: Path) -> bytes:

@@ -22,13 +22,15 @@ GREY_BGR = np.array([BLUE, GREEN, RED], dtype=np.float32)
 
 class Pixels(NamedTuple):
     """Memory layout of a pixel.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the
-    conversion to BGR; both are None if nothing has to be done.
+    conversion to BGR; both are None if nothing has to be done.  ``planes``: bytes in all as a multiple of the first
+    plane's, the only one that is used.
     """
 
     channels: int
     dtype: str
     conversion: str | None = None
     only: int | None = None
+    planes: float = 1.0
 
     @property
     def item_bytes(self) -> int:
@@ -50,13 +52,20 @@ ENCODINGS: dict[str, Pixels] = {
     "32FC1": Pixels(1, "f4"),
     "bgr8": Pixels(3, "u1"),
     "bgr16": Pixels(3, "u2"),
+    # OpenCV's types of several channels are in its order.
+    "8UC3": Pixels(3, "u1"),
+    "16UC3": Pixels(3, "u2"),
     "rgb8": Pixels(3, "u1", "COLOR_RGB2BGR"),
     "rgb16": Pixels(3, "u2", "COLOR_RGB2BGR"),
-    "bgra8": Pixels(4, "u1", "COLOR_BGRA2BGR"),
+    **{name: Pixels(4, "u1", "COLOR_BGRA2BGR") for name in ("bgra8", "8UC4")},
+    **{name: Pixels(4, "u2", "COLOR_BGRA2BGR") for name in ("bgra16", "16UC4")},
     "rgba8": Pixels(4, "u1", "COLOR_RGBA2BGR"),
+    "rgba16": Pixels(4, "u2", "COLOR_RGBA2BGR"),
     # Keep only the luma, white at the end of the range: it is all that is measured.
-    "yuv422_yuy2": Pixels(2, "u1", only=0),
-    "yuv422": Pixels(2, "u1", only=1),
+    **{name: Pixels(2, "u1", only=0) for name in ("yuv422_yuy2", "yuyv")},
+    **{name: Pixels(2, "u1", only=1) for name in ("yuv422", "uyvy")},
+    **{name: Pixels(1, "u1", only=0, planes=1.5) for name in ("nv12", "nv21")},
+    "nv24": Pixels(1, "u1", only=0, planes=3.0),
     **_bayer(),
 }
 """Raw pixel formats, named as in ROS 2."""
@@ -69,8 +78,7 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
     image = rows[:, : width * pixels.channels]
     if pixels.channels > 1:
         image = image.reshape(len(rows), width, pixels.channels)
-    if pixels.only is not None:
-        image = image[:, :, pixels.only]
+        image = image if pixels.only is None else image[:, :, pixels.only]
     # OpenCV handles only the machine's own byte order.
     image = np.ascontiguousarray(image, dtype=f"={pixels.dtype}")
     if pixels.only is None and pixels.conversion is None:
@@ -80,6 +88,17 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
     if pixels.conversion is None:
         return np.asarray(cv2.LUT(image, _GREY_OF_LUMA))
     return np.asarray(cv2.cvtColor(image, getattr(cv2, pixels.conversion)))
+
+
+def without_mosaic(image: Image, said: str) -> Image:
+    """A picture (H, W) in colour if it is a Bayer sensor's mosaic, by the ``format`` of a ``CompressedImage``: that of
+    ``compressed_image_transport``, ``bayer_rggb8; png compressed ``, where a conversion before it is named at the end.
+    """
+    encoding, _, how = said.partition(";")
+    pixels = ENCODINGS.get(f"{encoding.strip().rstrip('0123456789')}{8 * image.itemsize}")
+    if pixels is None or not encoding.startswith("bayer_") or len(how.split()) > 2 or image.ndim != 2:
+        return image
+    return unpacked(image, image.shape[1], pixels)
 
 
 def in_full_scale(frame: Frame, bit_depth: int) -> Frame:

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
@@ -28,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
 from benchmarks.dataset_set import write_video
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+STORE, STORE1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NS = 1_000_000_000
 WRIST = "observation.images.wrist"
 
@@ -76,13 +77,19 @@ def ros_messages(
         yield topic, kind, stamp_ns + 3_000_000, types[kind](_header(stamp_ns), *of)
 
 
-def write_mcap(path: Path, shots: Shots, change=lambda message: message, **how) -> None:
-    """As ``ros2 bag record -s mcap`` does, in chunks of some frames; each message as ``change`` makes it."""
+def write_mcap(
+    path: Path, shots: Shots, change=lambda message: message, kinds: Sequence[str] = ("",), **how
+) -> None:
+    """As ``ros2 bag record -s mcap`` does, in chunks of some frames; each message as ``change`` makes it, and of types
+    that end with one of ``kinds``.
+    """
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=20_000)
         writer.start("ros2")
         channels: dict[str, int] = {}
         for topic, kind, log_ns, sent in ros_messages(shots, **how):
+            if not kind.endswith(tuple(kinds)):
+                continue
             message = change(sent)
             if topic not in channels:
                 definition = STORE.generate_msgdef(kind)[0].encode()
@@ -100,6 +107,41 @@ def write_rosbag2(path: Path, shots: Shots, **how) -> None:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], log_ns, STORE.serialize_cdr(message, kind))
+
+
+def _as_ros1(value):
+    """ROS 1 numbers its headers, and has capitals in CameraInfo."""
+    if not hasattr(value, "__msgtype__"):
+        return value
+    type_of = STORE1.types[value.__msgtype__]
+    names = {name: getattr(value, name, getattr(value, name.lower(), 0)) for name in type_of.__dataclass_fields__}
+    return type_of(**{name: _as_ros1(each) for name, each in names.items() if name != "__msgtype__"})
+
+
+def write_ros1(path: Path, shots: Shots, *, mcap: bool = False, **how) -> None:
+    """A .bag of ROS 1, or what ``mcap convert`` makes of it."""
+    messages = [
+        (topic, kind, log_ns, bytes(STORE1.serialize_ros1(_as_ros1(message), kind)))
+        for topic, kind, log_ns, message in ros_messages(shots, **how)
+    ]
+    channels: dict = {}
+    if not mcap:
+        with Bag1Writer(path) as bag:
+            for topic, kind, log_ns, data in messages:
+                if topic not in channels:
+                    channels[topic] = bag.add_connection(topic, kind, typestore=STORE1)
+                bag.write(channels[topic], log_ns, data)
+        return
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros1")
+        for topic, kind, log_ns, data in messages:
+            if topic not in channels:
+                definition = STORE1.generate_msgdef(kind, ros_version=1)[0].encode()
+                schema = writer.register_schema(kind.replace("/msg/", "/"), "ros1msg", definition)
+                channels[topic] = writer.register_channel(topic, "ros1", schema)
+            writer.add_message(channels[topic], log_ns, data, log_ns)
+        writer.finish()
 
 
 def write_foxglove(path: Path, shots: Shots, *, video: bool = False) -> None:
@@ -123,6 +165,19 @@ def write_foxglove(path: Path, shots: Shots, *, video: bool = False) -> None:
             camera = CameraCalibration(width=lens.width_px, height=lens.height_px, distortion_model="plumb_bob", K=k)
             camera.D.extend(lens.coefficients)
             writer.write_message("/wrist/calibration", camera, shots.stamps_ns[0])
+
+
+def write_video_at(path: Path, images: Sequence[Image], times_s: Sequence[float], codec: str) -> None:
+    """A video (grey) whose frames are at these times, in the container that the name ends with."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"crf": "8"})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.codec_context.time_base = "yuv420p", Fraction(1, 90_000)
+        for image, time_s in zip(images, times_s, strict=True):
+            frame = av.VideoFrame.from_ndarray(image, format="gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = round(90_000 * time_s), Fraction(1, 90_000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
 
 
 def encoded(images: Sequence[Image], codec: str) -> list[bytes]:

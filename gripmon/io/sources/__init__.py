@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from gripmon.io.sources.bags import BagSettings, BagSource, is_rosbag2
+from gripmon.io.sources.bags import BAG_SUFFIXES, BagSettings, BagSource, is_rosbag2
 from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
 from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
 from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
@@ -118,10 +118,10 @@ def open_source(
 
 
 def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings | EpisodeSettings:
-    """Settings for a recorded input given as text: a folder of images, a LeRobot dataset, a rosbag2 folder, an MCAP
-    or .db3 file, otherwise a video file; ``fps`` (1/s) is used if the input has no time stamps.
+    """Settings for a recorded input given as text: a folder of images, a LeRobot dataset, a rosbag2 folder, an MCAP,
+    .db3 or .bag file, otherwise a video file; ``fps`` (1/s) is used if the input has no time stamps.
     """
-    if path.suffix.lower() in (".mcap", ".db3") or (path.is_dir() and is_rosbag2(str(path))):
+    if path.suffix.lower() in BAG_SUFFIXES or (path.is_dir() and is_rosbag2(str(path))):
         return BagSettings(path=str(path))
     if path.is_dir() and is_lerobot(str(path)):
         return LeRobotSettings(path=str(path))

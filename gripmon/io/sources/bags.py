@@ -1,7 +1,8 @@
-"""Recorded messages: an MCAP file, a .db3, or a folder of rosbag2, with images, joint states and camera calibrations.
+"""Recorded messages: an MCAP file, a .db3 or a folder of rosbag2, or a .bag of ROS 1, with images, joint states and
+camera calibrations.
 
-CDR is decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema in the file; JSON as Foxglove
-writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
+CDR and ROS 1's messages are decoded by ``rosbags``, Protobuf by ``mcap-protobuf-support``, from the schema in the file;
+JSON as Foxglove writes it.  Sources: the MCAP specification, Foxglove's schemas, ``sensor_msgs``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from gripmon.io.sources.payload import PayloadError, message_image
 from gripmon.io.sources.stamps import Stamped, rising
 from gripmon.io.sources.stored import (
     VideoDecoder,
-    decoded_file,
     file_system,
     joined,
     needed,
@@ -34,19 +34,22 @@ from gripmon.io.sources.stored import (
 )
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import one_line
+from gripmon.model.images import NOT_AN_IMAGE, grey_image
 from gripmon.model.jaw import JointOpening
+from gripmon.model.pixels import without_mosaic
 from gripmon.model.records import Array, Frame, Image
 
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 _IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
 _CAMERAS = ("CameraInfo", "CameraCalibration")
 _JOINTS = ("JointState",)
 
 
 class BagSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="bag"):
-    """An MCAP file or a rosbag2: frames with their stamps, and openings from joint states."""
+    """An MCAP file or a rosbag: frames with their stamps, and openings from joint states."""
 
     path: Annotated[
-        str, msgspec.Meta(min_length=1, description="the .mcap or .db3 file, or the folder with metadata.yaml")
+        str, msgspec.Meta(min_length=1, description="the .mcap, .db3 or .bag file, or the folder with metadata.yaml")
     ]
     camera: (
         Annotated[str, msgspec.Meta(min_length=1, description="topic of the images; absent: the only one")] | None
@@ -99,13 +102,13 @@ class _Mcap:
 
     def _decode(self, data: bytes, encoding: str, schema: Any) -> Any:
         """A decoded message, its fields as attributes.  ValueError for an unsupported encoding."""
-        if encoding == "cdr":
-            return _from_cdr(data, schema.name, schema.data.decode(errors="replace"))
+        if encoding in _OF_ROS:
+            return _of_ros(data, encoding, schema.name, schema.data.decode(errors="replace"))
         if encoding == "protobuf":
             return self._protobuf.decoder_for(encoding, schema)(data)
         if encoding == "json":
             return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
-        raise ValueError(f"a message in {encoding}; cdr, protobuf or json")
+        raise ValueError(f"a message in {encoding}; cdr, ros1, protobuf or json")
 
     @functools.cached_property
     def _protobuf(self) -> Any:
@@ -125,43 +128,47 @@ class _Mcap:
                 yield record
 
 
+_OF_ROS = {"cdr": "ROS2_JAZZY", "ros1": "ROS1_NOETIC"}
+"""Encodings, and whose types of messages are known beforehand; those we use are the same from Iron to Lyrical."""
+
+
 @functools.cache
-def typestore() -> Any:
-    """ROS 2 Jazzy's message types; those we use are the same from Iron to Lyrical.  Raises :class:`SourceError`."""
+def _types(encoding: str) -> Any:
+    """Raises :class:`SourceError`."""
     typesys = needed("rosbags.typesys")
-    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    return typesys.get_typestore(typesys.Stores[_OF_ROS[encoding]])
 
 
 def _kind(type_name: str) -> str:
     return type_name.replace(".", "/").rpartition("/")[2]
 
 
-def _from_cdr(data: bytes, type_name: str, definition: str = "") -> Any:
-    store = typestore()
-    if type_name not in store.types:
-        from rosbags.typesys import get_types_from_msg
+def _of_ros(data: bytes, encoding: str, type_name: str, definition: str) -> Any:
+    from rosbags.typesys import get_types_from_msg
 
-        store.register(get_types_from_msg(definition, type_name))
-    return store.deserialize_cdr(data, type_name)
+    store, name = _types(encoding), type_name if "/msg/" in type_name else type_name.replace("/", "/msg/")
+    if name not in store.types:
+        store.register(get_types_from_msg(definition, name))
+    return store.deserialize_cdr(data, name) if encoding == "cdr" else store.deserialize_ros1(data, name)
 
 
-class _Rosbag2:
-    """A folder of rosbag2 with SQLite or MCAP files, or a bare .db3, on this machine."""
+class _Rosbag:
+    """A folder of rosbag2 with SQLite or MCAP files, a bare .db3, or a .bag of ROS 1, on this machine."""
 
     whole = True
 
     def __init__(self, path: str) -> None:
-        from rosbags.rosbag2 import Reader
-
+        self._encoding = "ros1" if path.lower().endswith(".bag") else "cdr"
+        Reader = needed(f"rosbags.rosbag{'1' if self._encoding == 'ros1' else '2'}").Reader
         system, inside = file_system(path)
         if "file" not in (system.protocol if isinstance(system.protocol, tuple) else (system.protocol,)):
-            raise SourceError(f"path: {path}: rosbag2 is read on this machine only; .mcap files, or a copy")
+            raise SourceError(f"path: {path}: rosbags are read on this machine only; .mcap files, or a copy")
         self._path, self._reader = Path(inside), Reader
         try:
             with Reader(self._path) as reader:
                 self.types = {connection.topic: connection.msgtype for connection in reader.connections}
         except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
-            raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole rosbag2") from None
+            raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole rosbag") from None
 
     def messages(self, topics: list[str]) -> Iterator[_Message]:
         """Messages in order of their log times."""
@@ -169,16 +176,16 @@ class _Rosbag2:
             with self._reader(self._path) as reader:
                 wanted = [connection for connection in reader.connections if connection.topic in topics]
                 for connection, log_ns, data in reader.messages(connections=wanted):
-                    name = connection.msgtype
-                    yield _Message(connection.topic, _kind(name), log_ns, functools.partial(_from_cdr, data, name))
+                    name, definition = connection.msgtype, connection.msgdef.data
+                    decode = functools.partial(_of_ros, data, self._encoding, name, definition)
+                    yield _Message(connection.topic, _kind(name), log_ns, decode)
         except Exception as error:  # noqa: BLE001  as above
             raise _CutShort(one_line(error)[:200]) from None
 
 
-def open_messages(path: str) -> _Mcap | _Rosbag2:
+def open_messages(path: str) -> _Mcap | _Rosbag:
     """The messages of a file or folder.  Raises :class:`SourceError`."""
-    typestore()
-    return _Mcap(path) if path.lower().endswith(".mcap") else _Rosbag2(path)
+    return _Mcap(path) if path.lower().endswith(".mcap") else _Rosbag(path)
 
 
 def is_rosbag2(path: str) -> bool:
@@ -237,11 +244,15 @@ class BagSource(Stored):
         topics = self._topics(_IMAGES)
         if wanted in topics:
             return str(wanted)
-        there = ", ".join(topics) or "none"
+        there = ", ".join(topics)
+        if not topics:
+            others = ", ".join(f"{topic} ({name})" for topic, name in sorted(self._bag.types.items()))
+            wrong = f"camera: {self._path} has no topic with images ({', '.join(_IMAGES)})"
+            raise SourceError(f"{wrong}; its topics: {others or 'none'}")
         if wanted is not None:
             raise SourceError(f"camera: {self._path} has no images on {wanted}; one of its topics with images: {there}")
         if len(topics) != 1:
-            raise SourceError(f"camera: {self._path} has several topics with images, or none; one of: {there}")
+            raise SourceError(f"camera: {self._path} has several topics with images; one of: {there}")
         return topics[0]
 
     def _joints(self, opening: JointOpening | None) -> tuple[np.ndarray, Array]:
@@ -306,11 +317,14 @@ class BagSource(Stored):
     def _image(self, message: Any, kind: str) -> tuple[Image | None, str | None]:
         try:
             data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
-            if kind == "CompressedImage":
-                return decoded_file(data)
-            if kind == "CompressedVideo":
+            if kind == "CompressedVideo" or (kind == "CompressedImage" and VideoDecoder.knows(message.format)):
                 self._decoder = self._decoder or VideoDecoder(message.format)
                 return self._decoder.decode(data)
+            if kind == "CompressedImage":
+                image, fault = grey_image(data)
+                if fault == NOT_AN_IMAGE:
+                    fault = f"{fault}: format {message.format!r:.60}; JPEG, PNG, WebP or {VideoDecoder.NAMES}"
+                return (image if image is None else without_mosaic(image, message.format)), fault
             return message_image(message, data, (int(message.width), int(message.height))), None
         except PayloadError as error:
             return None, str(error)

@@ -19,6 +19,7 @@ from gripmon.io.sources.stored import file_system
 from gripmon.model.errors import one_line
 from gripmon.model.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key
 
+_BAGS = (".mcap", ".bag")
 _ANNOTATION = ".gripmon.mcap"
 """Ending of files that an earlier ``gripmon dataset`` wrote beside recordings; these are not episodes."""
 
@@ -41,7 +42,7 @@ class Episode(msgspec.Struct, frozen=True):
 
 
 def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
-    """All episodes below a folder or URL, in natural order: LeRobot datasets, MCAP files, rosbag2 folders, folders of
+    """All episodes below a folder or URL, in natural order: LeRobot datasets, MCAP files, rosbags, folders of
     images (``timestamps.csv`` beside them), videos; nothing in hidden folders.
 
     ``cameras``: topics or features, one episode for each; none: the only one.  Opens only the files that describe a
@@ -73,7 +74,7 @@ def find_episodes(root: str, cameras: Sequence[str] = ()) -> list[Episode]:
         elif not remote:
             episodes.append(Episode(name or posixpath.basename(path), kind(path=at), version))
     if not episodes:
-        right = "LeRobot datasets, .mcap files, rosbag2 folders, folders of images or videos"
+        right = "LeRobot datasets, .mcap or .bag files, rosbag2 folders, folders of images or videos"
         if any(path.endswith(".rrd") for path in files):
             right += "; for gripmon's own recordings there are gripmon report, correct and export"
         raise SourceError(f"path: there is no episode in {root}; {right}")
@@ -104,8 +105,8 @@ def _recordings(files: Sequence[str]) -> Iterator[tuple[type[Any], str, list[str
         if any(suffix in IMAGE_SUFFIXES for suffix in suffixes.values()):
             yield FolderSettings, folder, inner
         for path, suffix in suffixes.items():
-            if suffix == ".mcap" or suffix in VIDEO_SUFFIXES:
-                yield BagSettings if suffix == ".mcap" else VideoSettings, path, [path]
+            if suffix in _BAGS or suffix in VIDEO_SUFFIXES:
+                yield BagSettings if suffix in _BAGS else VideoSettings, path, [path]
 
 
 def _of_lerobot(path: str, name: str, cameras: Sequence[str], files: dict[str, dict[str, Any]]) -> list[Episode]:

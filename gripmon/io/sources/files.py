@@ -9,11 +9,12 @@ import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import msgspec
 
 from gripmon.io.sources.base import SourceError, Stored
+from gripmon.io.sources.stored import needed, video_frames
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image, regular_bytes
 from gripmon.model.records import Frame
 from gripmon.model.records.values import NS_PER_S
@@ -25,6 +26,8 @@ _log = logging.getLogger(__name__)
 
 TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
+MOST_FPS = 10_000
+"""Highest frame rate of a recording (1/s)."""
 
 
 class FolderSettings(
@@ -34,7 +37,7 @@ class FolderSettings(
 
     path: Annotated[str, msgspec.Meta(min_length=1, description="folder with the images")]
     fps: Annotated[
-        float, msgspec.Meta(gt=0, le=10000, description="frame rate where there are no time stamps (1/s)")
+        float, msgspec.Meta(gt=0, le=MOST_FPS, description="frame rate where there are no time stamps (1/s)")
     ] = 25.0
     timestamps: Annotated[
         str | None,
@@ -144,7 +147,7 @@ def _stamp(cell: str, where: str) -> int:
     try:
         stamp_ns = int(cell)
     except ValueError:
-        raise SourceError(f"{where}: stamp_ns is '{cell.strip()}'; a whole number of nanoseconds") from None
+        raise SourceError(f"{where}: stamp_ns is {cell.strip()!r:.60}; a whole number of nanoseconds") from None
     if not 0 <= stamp_ns < 2**63:
         raise SourceError(f"{where}: stamp_ns is {stamp_ns}; 0 or more, below 2^63")
     return stamp_ns
@@ -159,7 +162,7 @@ def _opening(cell: str, where: str) -> float | None:
         opening_m = math.nan
     if not 0.0 <= opening_m <= 1.0:
         raise SourceError(
-            f"{where}: jaw_opening_m is '{cell.strip()}'; metres, 0 to 1, or nothing where it isn't known"
+            f"{where}: jaw_opening_m is {cell.strip()!r:.60}; metres, 0 to 1, or nothing where it isn't known"
         )
     return opening_m
 
@@ -170,6 +173,10 @@ def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> Non
             raise SourceError(
                 f"{path}: stamp_ns doesn't rise from {earlier} to {later}; stamps that rise in the files' order"
             )
+    steps_ns = sorted(rows[later].stamp_ns - rows[earlier].stamp_ns for earlier, later in itertools.pairwise(names))
+    if len(steps_ns) >= 3 and (usual_ns := steps_ns[len(steps_ns) // 2]) < NS_PER_S / MOST_FPS:
+        wrong = f"stamp_ns rises by {usual_ns} from image to image, as of more than {MOST_FPS:,} frames/s"
+        raise SourceError(f"{path}: {wrong}; nanoseconds")
 
 
 class VideoSettings(
@@ -180,7 +187,8 @@ class VideoSettings(
     path: Annotated[str, msgspec.Meta(min_length=1, description="the video file")]
     fps: (
         Annotated[
-            float, msgspec.Meta(gt=0, le=10000, description="replaces the container's time stamps by frame / fps (1/s)")
+            float,
+            msgspec.Meta(gt=0, le=MOST_FPS, description="replaces the container's time stamps by frame / fps (1/s)"),
         ]
         | None
     ) = None
@@ -190,25 +198,20 @@ class VideoSource(Stored):
     """Frames with the container's time stamps, counted from its beginning, since a container has no Unix time.
 
     Containers round (Matroska to 1 ms).  A frame whose stamp doesn't increase becomes a frame with a fault: give
-    ``fps`` for files without usable stamps.  Images are BGR, even for grey videos.
+    ``fps`` for files without usable stamps.  Images are BGR, even for grey videos.  What OpenCV can't decode, such as
+    AV1, is left to PyAV.
     """
 
     def __init__(self, settings: VideoSettings, relative_to: Path) -> None:
-        import cv2
-
         self._path = relative_to / settings.path
         if not self._path.is_file():
             raise SourceError(f"path: there is no file {self._path}; a video file")
-        self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        if not self._capture.isOpened():
-            raise SourceError(f"path: {self._path} can't be opened as a video; a complete file in a format of FFmpeg's")
-        # Pixels are as the sensor has them, as in every other container: the lens is of the sensor.
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        self._stamp_property = cv2.CAP_PROP_POS_MSEC
-        self._announced = round(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # an estimate in some containers
+        self._capture, self._due_s = _opened_video(self._path)
+        self._is_there = True  # the next frame was grabbed
         self._fps = settings.fps
         self._seq = 0
-        self._last_stamp_ns = -1
+        self._last_ns = self._last_stamp_ns = -1
+        self._longest_ns = 0
         self._open = True
         self._lock = threading.Lock()  # releasing a capture while it reads would crash
 
@@ -223,11 +226,13 @@ class VideoSource(Stored):
     def _next_frame(self) -> Frame | None:
         if not self._open:
             return None
-        if not self._capture.grab():
-            if self._seq < self._announced - 1:
-                _log.warning("%s ends after %d of %d frames; is it truncated?", self._path, self._seq, self._announced)
+        if not (self._is_there or self._capture.grab()):
+            if self._due_s > 1e-9 * (self._last_ns + self._longest_ns):
+                end_s = 1e-9 * self._last_ns
+                _log.warning("%s ends after %.3g s of %.3g s; is it truncated?", self._path, end_s, self._due_s)
             self._end()
             return None
+        self._is_there = False
         stamp_ns, fault = self._stamp()
         decoded, image = self._capture.retrieve()
         if not decoded:
@@ -242,10 +247,82 @@ class VideoSource(Stored):
         self._capture.release()
 
     def _stamp(self) -> tuple[int, str | None]:
+        stamp_ms = self._capture.get(_CAP_PROP_POS_MSEC)
+        at_ns = round(stamp_ms * 1e6) if math.isfinite(stamp_ms) else -1
+        if self._seq:
+            self._longest_ns = max(self._longest_ns, at_ns - self._last_ns)
+        self._last_ns = max(at_ns, self._last_ns)
         if self._fps is not None:
             return round(self._seq * NS_PER_S / self._fps), None
-        stamp_ms = self._capture.get(self._stamp_property)
-        stamp_ns = round(stamp_ms * 1e6) if math.isfinite(stamp_ms) else -1
-        if stamp_ns <= self._last_stamp_ns:
+        if at_ns <= self._last_stamp_ns:
             return max(self._last_stamp_ns, 0), "the container's time stamp does not rise; give source.fps"
-        return stamp_ns, None
+        return at_ns, None
+
+
+_CAP_PROP_POS_MSEC = 0  # OpenCV's
+
+
+class _Capture(Protocol):
+    """An open video, as OpenCV's."""
+
+    def grab(self) -> bool: ...
+    def retrieve(self) -> tuple[bool, Any]: ...
+    def get(self, property_number: int) -> float: ...
+    def release(self) -> None: ...
+
+
+def _opened_video(path: Path) -> tuple[_Capture, float]:
+    """A video whose first frame was grabbed, and when, by its header, its last frame but one is due (s); 0: unknown.
+
+    The number of frames is an estimate in some containers, by the length and the mean rate.
+    """
+    import cv2
+
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise SourceError(f"path: {path} can't be opened as a video; a complete file in a format of FFmpeg's")
+    # Pixels are as the sensor has them, as in every other container: the lens is of the sensor.
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    due_s = (capture.get(cv2.CAP_PROP_FRAME_COUNT) - 2.0) / fps if fps > 0.0 else 0.0
+    if capture.grab():
+        return capture, due_s
+    codec = round(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1")
+    capture.release()
+    try:
+        other = _ByPyAv(path)
+        if other.grab():
+            return other, due_s
+    except SourceError as error:
+        raise SourceError(f"path: {path}: OpenCV can't decode {codec!r}, PyAV can ({error})") from None
+    raise SourceError(f"path: {path} has no frame that can be decoded ({codec!r}); a complete video")
+
+
+class _ByPyAv:
+    """A video by PyAV; its frames are as it has them, whatever it says of the way up."""
+
+    def __init__(self, path: Path) -> None:
+        needed("av")
+        self._frames = video_frames(str(path), 0.0)
+        self._first_s = math.nan
+        self._frame: tuple[float, Any] | None = None
+
+    def grab(self) -> bool:
+        try:
+            self._frame = next(self._frames, None)
+        except SourceError:
+            self._frame = None
+        if self._frame is not None and math.isnan(self._first_s):
+            self._first_s = self._frame[0]
+        return self._frame is not None
+
+    def retrieve(self) -> tuple[bool, Any]:
+        assert self._frame is not None
+        return True, self._frame[1].to_ndarray(format="bgr24")
+
+    def get(self, property_number: int) -> float:
+        assert property_number == _CAP_PROP_POS_MSEC and self._frame is not None
+        return 1e3 * (self._frame[0] - self._first_s)
+
+    def release(self) -> None:
+        self._frames.close()

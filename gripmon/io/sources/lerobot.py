@@ -19,8 +19,9 @@ import msgspec
 import numpy as np
 
 from gripmon.io.sources.base import SourceError, Stored
-from gripmon.io.sources.stored import decoded_file, file_system, joined, needed, opened, there
+from gripmon.io.sources.stored import file_system, joined, needed, opened, there, video_frames
 from gripmon.model.errors import one_line
+from gripmon.model.images import grey_image
 from gripmon.model.jaw import JointOpening
 from gripmon.model.records import Array, Frame, Image
 
@@ -61,6 +62,7 @@ class _Info(msgspec.Struct, frozen=True):
 _Number = Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
 _Value = Annotated[float, msgspec.Meta(ge=0, lt=1e9)] | None
 _MOST_JOINTS = 1000
+_LONGEST_S = 1e9
 
 
 class _Episode(msgspec.Struct, frozen=True):
@@ -210,7 +212,8 @@ class LeRobotSource(Stored):
             return None
         seq, self._seq = self._seq, self._seq + 1
         image, fault = next(self._images)
-        opening_m = None if self._openings_m is None else float(self._openings_m[seq])
+        reported_m = np.nan if self._openings_m is None else float(self._openings_m[seq])
+        opening_m = reported_m if np.isfinite(reported_m) else None
         return Frame(seq, round(1e9 * float(self._time_s[seq])), image, opening_m, self._camera, fault)
 
     def close(self) -> None:
@@ -236,10 +239,11 @@ class LeRobotSource(Stored):
                     state = np.array(table[_STATE].to_pylist(), float).reshape(len(time_s), -1)
                     at = [dataset.joints.index(name) for name in opening.joints]
                     openings_m = opening.offset_m + opening.scale * state[:, at].sum(axis=1)
-            except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+            except Exception as error:  # noqa: BLE001  a stranger's table, and Arrow's own errors
                 raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole table") from None
-        if not len(time_s) or (np.diff(time_s) <= 0.0).any():
-            raise SourceError(f"path: {path}: episode {self._episode} has no rows, or time stamps that don't rise")
+        if not len(time_s) or not (np.diff(time_s) > 0.0).all() or not 0.0 <= time_s[0] <= time_s[-1] < _LONGEST_S:
+            wrong = f"episode {self._episode} has no rows, or time stamps that don't rise"
+            raise SourceError(f"path: {path}: {wrong}; seconds from its beginning")
         return time_s, openings_m, None if is_video else table[self._camera].to_pylist()
 
     def _decoded(self, video: tuple[str, float] | None) -> Iterator[tuple[Image | None, str | None]]:
@@ -247,12 +251,12 @@ class LeRobotSource(Stored):
         if video is None:
             for row in self._files or ():
                 found = row.get("bytes") if isinstance(row, dict) else None
-                yield decoded_file(found) if isinstance(found, bytes) and found else (None, "the table has none here")
+                yield grey_image(found) if isinstance(found, bytes) and found else (None, "the table has none here")
             return
         path, begin_s = video
         half_s = 0.5 * float(np.median(np.diff(self._time_s))) if len(self) > 1 else 0.5 / self._dataset.description.fps
         row, fault = 0, None
-        frames = _video_frames(path, begin_s - half_s)
+        frames = video_frames(path, begin_s - half_s)
         grey = needed("av.video.reformatter").VideoReformatter()
         while row < len(self):
             try:
@@ -276,22 +280,6 @@ def _chosen(key: str, wanted: Any, named: list[Any], path: str) -> Any:
     if len(named) != 1:
         raise SourceError(f"{key}: {path} has {len(named)}; one of: {shown or 'none'}")
     return named[0]
-
-
-def _video_frames(path: str, begin_s: float) -> Iterator[tuple[float, Any]]:
-    """Frames of a video with their times (s), from ``begin_s``.  Raises :class:`SourceError` where it is damaged."""
-    av = needed("av")
-    with opened(path) as file:
-        try:
-            with av.open(file) as container:
-                stream = container.streams.video[0]
-                stream.codec_context.thread_count = 1
-                container.seek(max(int(begin_s / stream.time_base), 0), stream=stream)
-                for frame in container.decode(stream):
-                    if frame.time is not None and frame.time >= begin_s:
-                        yield frame.time, frame
-        except (av.error.FFmpegError, OSError, IndexError) as error:
-            raise SourceError(f"{path} can't be decoded ({one_line(error):.200}); is it truncated?") from None
 
 
 def is_lerobot(path: str) -> bool:

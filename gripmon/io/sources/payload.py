@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -72,9 +73,12 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
     step = row if note.step is None else note.step
     if step < row or step % item:
         raise PayloadError(f"step {step}; at least {row} bytes, a multiple of {item}")
-    if len(payload) != step * note.height:
-        raise PayloadError(f"{len(payload)} bytes; {step * note.height} ({note.height} rows of {step})")
-    rows = np.frombuffer(payload, f"<{pixels.dtype}").reshape(note.height, step // item)
+    first = step * note.height
+    if len(payload) != math.ceil(pixels.planes * first):
+        planes = f", and {pixels.planes - 1.0:g} times as many" * (pixels.planes != 1.0)
+        expected = f"{math.ceil(pixels.planes * first)} ({note.height} rows of {step}{planes})"
+        raise PayloadError(f"{len(payload)} bytes; {expected}")
+    rows = np.frombuffer(payload[:first], f"<{pixels.dtype}").reshape(note.height, step // item)
     return unpacked(rows, note.width, pixels)
 
 

@@ -19,6 +19,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.errors import one_line
 from gripmon.model.images import JPEG, PNG
 from gripmon.model.jaw import JointOpening, positions_by_joint
+from gripmon.model.pixels import without_mosaic
 from gripmon.model.records.values import NS_PER_S
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -68,7 +69,7 @@ class Ros2Camera(ArrivingCamera):
         self._openings = Openings(travel_m, JAW_MAX_AGE_S)
         self._joints = Malformed("joint state", settings.joint_states or "")
         self._subscription: Any = None
-        self._type = self._waits = self._info = self._info_fault = self._contradiction = ""
+        self._type = self._waits = self._several = self._info = self._info_fault = self._contradiction = ""
         self._next_info_s = 0.0
         try:
             check_rclpy()
@@ -82,7 +83,9 @@ class Ros2Camera(ArrivingCamera):
 
     def fault(self) -> str:
         opening = "" if self._settings.opening is None else self._openings.fault()
-        faults = (self._node.fault(), super().fault(), self._info_fault, opening, self._joints.fault())
+        faults = (
+            self._node.fault(), super().fault(), self._several, self._info_fault, opening, self._joints.fault(),
+        )  # fmt: skip
         return "; ".join(fault for fault in faults if fault)
 
     def close(self) -> None:
@@ -105,7 +108,10 @@ class Ros2Camera(ArrivingCamera):
         from sensor_msgs.msg import CompressedImage, Image
 
         known = {IMAGE: Image, COMPRESSED_IMAGE: CompressedImage}
-        types = {found.topic_type for found in node.get_publishers_info_by_topic(self.key)}
+        publishers = node.get_publishers_info_by_topic(self.key)
+        types = {found.topic_type for found in publishers}
+        mixed = f"{self.key} has {len(publishers)} publishers, whose images come mixed; one"
+        self._several = mixed if len(publishers) > 1 else ""
         domain = f"in ROS domain {self._node.domain_id}"
         if not types:
             there = node.get_topic_names_and_types()
@@ -173,7 +179,7 @@ class Ros2Camera(ArrivingCamera):
         if kind == IMAGE:
             image = message_image(message, data, self._size_px)
         elif data.startswith((JPEG, PNG)) and "compressedDepth" not in message.format:
-            image = file_image(data, self._size_px)
+            image = without_mosaic(file_image(data, self._size_px), message.format)
         else:
             raise PayloadError(f"format {message.format[:40]!r}, first {data[:8].hex() or 'nothing'}; JPEG or PNG")
         stamp_ns = _stamp_ns(message) or arrival.unix_ns

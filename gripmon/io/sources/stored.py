@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import posixpath
+from collections.abc import Generator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar
 
@@ -12,9 +13,7 @@ from numpy.typing import NDArray
 
 from gripmon.io.sources.base import SourceError
 from gripmon.model.errors import one_line
-from gripmon.model.images import JPEG
 from gripmon.model.jaw import opening_between
-from gripmon.model.jpeg import jpeg_fault
 from gripmon.model.records import Array, Image
 
 if TYPE_CHECKING:
@@ -91,33 +90,22 @@ def openings_at(stamps_ns: NDArray[np.int64], openings_m: Array, wanted_ns: int)
     return opening_between(first, last, wanted_ns)
 
 
-def decoded_file(data: bytes) -> tuple[Image | None, str | None]:
-    """The image in a JPEG's or PNG's bytes, only its brightness (nothing else is measured); or why there is
-    none.  Pixels are as the sensor has them, whatever EXIF says of the way up: the lens is of the sensor.
-    """
-    import cv2
-
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-
-    if data.startswith(JPEG) and (fault := jpeg_fault(data)) is not None:
-        return None, fault
-    try:
-        image: Image | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
-    return image, None if image is not None else "truncated, damaged or not an image"
-
-
 class VideoDecoder:
     """Pictures from packets of an elementary stream, in grey levels; in one thread, so that nothing else waits."""
 
     CODECS: ClassVar = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "av1"}
+    NAMES = ", ".join(CODECS)
+
+    @classmethod
+    def knows(cls, format_name: object) -> bool:
+        """Whether that is a format of videos."""
+        return str(format_name).lower() in cls.CODECS
 
     def __init__(self, format_name: str) -> None:
         """``format_name``: as foxglove.CompressedVideo has it.  Raises ValueError for another one."""
-        codec = self.CODECS.get(format_name.lower())
-        if codec is None:
-            raise ValueError(f"a video of format {format_name!r}; one of {', '.join(self.CODECS)}")
+        if not self.knows(format_name):
+            raise ValueError(f"a video of format {format_name!r}; one of {self.NAMES}")
+        codec = self.CODECS[format_name.lower()]
         av = needed("av")
         self._context, self._packet, self._error = av.CodecContext.create(codec, "r"), av.Packet, av.error.FFmpegError
         self._context.thread_count = 1
@@ -131,3 +119,19 @@ class VideoDecoder:
         if not frames:
             return None, "the video frame can't be decoded (none before the first key frame)"
         return frames[-1].to_ndarray(format="gray"), None
+
+
+def video_frames(path: str, begin_s: float) -> Generator[tuple[float, Any]]:
+    """Frames of a video with their times (s), from ``begin_s``.  Raises :class:`SourceError` where it is damaged."""
+    av = needed("av")
+    with opened(path) as file:
+        try:
+            with av.open(file) as container:
+                stream = container.streams.video[0]
+                stream.codec_context.thread_count = 1
+                container.seek(max(int(begin_s / stream.time_base), 0), stream=stream)
+                for frame in container.decode(stream):
+                    if frame.time is not None and frame.time >= begin_s:
+                        yield frame.time, frame
+        except (av.error.FFmpegError, OSError, IndexError) as error:
+            raise SourceError(f"{path} can't be decoded ({one_line(error):.200}); is it truncated?") from None
