@@ -311,6 +311,18 @@ def test_it_is_the_average_of_the_first_frames_that_proved_a_pose():
     assert at.jaw_opening_m == pytest.approx(0.03 + 1e-5 * 14.5)
 
 
+def test_before_a_frame_has_proved_a_pose_the_motion_is_that_since_the_first_one():
+    """Also where that isn't at the reference: a mount that moves isn't said to stand still."""
+    kept, first_T = begun(), moved(np.eye(4), np.array([0.0, 0.0, 9e-3, 0.0, 0.0, 0.0]))
+    way = np.array([2.5e-3, 0.0, 1e-3, 0.01, 0.0, 0.0])
+    at, covariance = kept.quantity(first_T, np.eye(6))
+    assert np.allclose(at, np.eye(4)) and np.allclose(covariance, 2.0 * np.eye(6))
+    later, _ = kept.quantity(perturb(first_T, way), np.eye(6))
+    assert later == pytest.approx(perturb(first_T, way) @ np.linalg.inv(first_T))
+    kept.refer(reference_at(np.eye(4)))
+    assert np.allclose(kept.quantity(perturb(first_T, way), np.eye(6))[0], np.eye(4))
+
+
 @pytest.mark.parametrize(
     ("frames", "shift_m", "anew"),
     [(5, 0.9e-3, True), (5, 1.1e-3, False), (6, 0.9e-3, False), (1, 0.9e-3, True)],

@@ -260,13 +260,16 @@ class AtReferences:
 
     def quantity(self, cam_T_grip: Array, covariance: Array) -> tuple[Array, Array]:
         """What is published of a measured pose (4, 4) and its covariance (6, 6): these, or those of exp(d) reference.
-        Before a frame has proved a pose every frame is the first one, with d = 0.
+        Before a frame has proved a pose d is the motion since the first one: nothing bounds it, but a mount that moves
+        isn't said to stand still.
         """
         if self._valid_by is ValidBy.ABSOLUTE:
             return cam_T_grip, covariance
         first = self.current
         if first is None:
-            return self.reference_T, 2.0 * covariance
+            if self._unproved_T is None:
+                self._unproved_T = cam_T_grip
+            return cam_T_grip @ invert(self._unproved_T) @ self.reference_T, 2.0 * covariance
         of_motion = first.covariance_of(covariance, cam_T_grip, self.reference_T)
         return first.motion(cam_T_grip) @ self.reference_T, of_motion
 
@@ -287,6 +290,7 @@ class AtReferences:
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
         self._growing = None
+        self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""
