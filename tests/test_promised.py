@@ -22,6 +22,7 @@ from gripmon.daemon.promised import images_of as images_to_judge
 from gripmon.daemon.promised import picture_of
 from gripmon.model.geometry import to_record
 from gripmon.model.records import NOTHING_WRONG, ValidBy, Verdict
+from gripmon.teach.drawing import Canvas
 from gripmon.teach.kept import Kept, Sizes
 from gripmon.track.edges.words import in_words
 
@@ -191,3 +192,14 @@ def test_stills_of_a_real_xarm_are_promised_what_they_keep_and_nearly_all_are_ta
     assert len(teaching.images) >= 22  # 18 of 26 where play was a reason to leave an image out
     before, after = teaching.kept()
     assert after.since_reference.median_m < before.since_reference.median_m
+
+
+def test_a_picture_shows_fingers_of_thirty_pixels_large_and_never_leaves_the_image():
+    image = np.zeros((720, 1280), np.uint8)
+    image[700, 310] = 255
+    small = Canvas.about(image, np.array([[300.0, 690.0], [360.0, 719.0]]), 1200)
+    assert small.zoom == 8 and small.picture.shape == (60 * 8, 121 * 8, 3)
+    u, v = small.pixel(np.array([310.0, 700.0]))
+    assert small.picture[v, u].min() > 200
+    whole = Canvas.about(image, np.array([[100.0, 50.0], [1200.0, 700.0]]), 1200)
+    assert whole.zoom == 1 and whole.picture.shape == (720, 1280, 3)

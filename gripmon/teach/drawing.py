@@ -22,19 +22,35 @@ from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 Colour = tuple[int, int, int]
 """Blue, green, red."""
 
+_LARGEST_ZOOM, _LEAST_BESIDE_PX = 8, 20.0
+
 _SHIFT = 4  # fractional bits of a pixel in OpenCV's drawing functions
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Canvas:
-    """An image enlarged by ``zoom``: ``picture`` (h, w, 3), BGR of 8 bits."""
+    """An image, or the part of it from ``origin_px`` on, enlarged by ``zoom``: ``picture`` (h, w, 3), BGR of 8 bits."""
 
-    def __init__(self, image: Image, zoom: int) -> None:
+    def __init__(self, image: Image, zoom: int, origin_px: tuple[int, int] = (0, 0)) -> None:
+        self._origin_px = np.array(origin_px)
         scaled = image.astype(np.float32) * (255.0 / full_scale(image))
         grey = cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.ndim == 3 else scaled
         large = cv2.resize(np.clip(grey, 0.0, 255.0).astype(np.uint8), None, fx=zoom, fy=zoom)
         self.picture: Image = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
         self.zoom = zoom
+
+    @classmethod
+    def about(cls, image: Image, points_px: Array, width_px: int) -> Canvas:
+        """The part of an image around points (n, 2), with as much beside them as they take, some ``width_px`` wide: of
+        fingers of 30 px nothing can be seen in a whole image.
+        """
+        height, width = image.shape[:2]
+        low, high = points_px.min(axis=0), points_px.max(axis=0)
+        beside = max(float((high - low).max()) / 2.0, _LEAST_BESIDE_PX)
+        left, top = np.maximum(np.floor(low - beside), 0.0).astype(int).tolist()
+        right, bottom = np.minimum(np.ceil(high + beside) + 1.0, (width, height)).astype(int).tolist()
+        zoom = int(np.clip(-(-width_px // max(right - left, 1)), 1, _LARGEST_ZOOM))
+        return cls(image[top:bottom, left:right], zoom, (left, top))
 
     def circle(self, at_px: Array, radius_px: float, colour: Colour) -> None:
         """Draw a circle; ``radius_px`` in the picture's own pixels."""
@@ -47,12 +63,12 @@ class Canvas:
 
     def pixel(self, at_px: Array) -> tuple[int, int]:
         """The position in the picture's own pixels."""
-        u, v = np.rint((np.asarray(at_px) + 0.5) * self.zoom - 0.5).astype(int).tolist()
+        u, v = np.rint((np.asarray(at_px) - self._origin_px + 0.5) * self.zoom - 0.5).astype(int).tolist()
         return u, v
 
     def _fixed(self, points_px: Array) -> Array:
         """Points (n, 2) in OpenCV's fixed-point coordinates of the picture."""
-        own = (np.reshape(points_px, (-1, 2)) + 0.5) * self.zoom - 0.5
+        own = (np.reshape(points_px, (-1, 2)) - self._origin_px + 0.5) * self.zoom - 0.5
         return np.rint(own * (1 << _SHIFT)).astype(np.int32)
 
 
@@ -75,7 +91,7 @@ def enlargement(largest_px: float, to_px: float) -> int:
     return max((k for k in (1, 2, 5, 10, 20, 50, 100, 200, 500) if k * largest_px <= to_px), default=1)
 
 
-_ENLARGED_TO_PX = 12.0  # length at which the largest offset is drawn, at most
+_ENLARGED_TO_PX = 24.0  # length in the picture at which the largest offset is drawn, at most
 _SHARP_BGR, OUTLINE_BGR, CREASE_BGR, CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
 _DOUBTED_BGR, _TEXT_BGR = (70, 70, 250), (255, 255, 255)
 _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
@@ -88,13 +104,12 @@ def draw_taught(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, image: TeachingImage, taught: TaughtEdges, model: TaughtModel
 ) -> Image:
     """The teaching image, BGR, with the sharp model's edges, the taught ones, and the taught corners by name."""
-    zoom = max(1, -(-_SMALLEST_PX // camera.width_px))
-    canvas = Canvas(image.image, zoom)
     points_grip_m = gripper.points_grip_m(image.jaw_opening_m if gripper.has_jaw else None)
     known = np.flatnonzero(taught.known).tolist()
     lines = {edge: _line(camera, gripper, cam_T_grip, points_grip_m, taught, edge) for edge in known}
+    canvas = Canvas.about(image.image, np.concatenate([uv_px for uv_px, _ in lines.values()]), _SMALLEST_PX)
     largest_px = max((float(np.nanmax(np.abs(shift))) for _, shift in lines.values()), default=0.0)
-    enlarged = enlargement(largest_px, _ENLARGED_TO_PX)
+    enlarged = enlargement(canvas.zoom * largest_px, _ENLARGED_TO_PX)
     for edge, (uv_px, shift_px) in lines.items():
         colour = CREASE_BGR if taught.crease[edge] else OUTLINE_BGR
         canvas.line(uv_px, _SHARP_BGR)
@@ -127,13 +142,16 @@ def draw_doubted(
     """The image, BGR, with the gripper's ``visible`` (e,) edges at the reference, and those that make the bound as
     large, ``doubted`` (e,), in red; ``why`` in words above.
     """
-    zoom = max(1, -(-_SMALLEST_PX // camera.width_px))
-    canvas = Canvas(image.image, zoom)
     points_grip_m = gripper.points_grip_m(image.jaw_opening_m if gripper.has_jaw else None)
     edges = np.flatnonzero(visible)
     outlines = gripper.outlines_m(points_grip_m, edges, 33) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-    for edge, uv_px in zip(edges.tolist(), map(camera.project, outlines), strict=True):
-        uv_px = uv_px[np.isfinite(uv_px).all(axis=1)]
+    lines = [uv_px[np.isfinite(uv_px).all(axis=1)] for uv_px in map(camera.project, outlines)]
+    height, width = image.image.shape[:2]
+    drawn = np.concatenate([np.zeros((0, 2)), *lines])
+    inside = ((drawn >= 0.0) & (drawn < (width, height))).all(axis=1)
+    around = drawn[inside] if inside.any() else np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
+    canvas = Canvas.about(image.image, around, _SMALLEST_PX)
+    for edge, uv_px in zip(edges.tolist(), lines, strict=True):
         if len(uv_px) > 1:
             canvas.line(uv_px, _DOUBTED_BGR if doubted[edge] else _SHARP_BGR, 3 if doubted[edge] else 1)
     Labels(canvas.picture).title("gripper at the reference (blue); what costs most (red)", why)
@@ -237,7 +255,6 @@ def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool
 
 
 _WIDTH_PX = 1400
-_LARGEST_ZOOM = 4
 _RESIDUALS_TO_PX = 25.0
 _USED: Colour = (120, 220, 90)
 _UNUSED: Colour = (70, 70, 250)
@@ -252,7 +269,7 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
     (yellow), and lines from where the calibration predicts each of them towards where it was measured, enlarged by the
     factor in the caption; the gripper's axes at the TCP.
     """
-    zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, _LARGEST_ZOOM))
+    zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, 4))
     canvas = Canvas(image, zoom)
     residuals, used = found.plate.residuals_px[0], found.plate.used[0]
     sizes = np.linalg.norm(residuals[used], axis=1)

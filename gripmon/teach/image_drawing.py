@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gripmon.model.records import Array, Image
-from gripmon.teach.drawing import Canvas, Colour, write
+from gripmon.teach.drawing import Canvas, Colour, Labels, write
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.straight_pieces import Chain
 
@@ -17,14 +17,17 @@ _INNER: Colour = (0, 144, 255)
 _TEXT: Colour = (255, 255, 255)
 _SCATTER: Colour = (64, 64, 255)
 _UNSEEN: Colour = (255, 64, 255)
-_ENLARGED = 50.0
+_ENLARGED = 10.0
+_WIDTH_PX = 1400
 
 
 def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Image:
-    """Draw outlines by finger, corners as circles, and inner edges; at each vertex its scatter, three standard
-    deviations, enlarged; what of the outline doesn't show, as dots.
+    """Draw outlines by finger, corners as circles, and inner edges, over the part of the image around them; at each
+    vertex its scatter, three standard deviations, enlarged; what of the outline doesn't show, as dots.
     """
-    canvas = Canvas(image, 2 if image.shape[1] < 1000 else 1)
+    outlines = [chain.uv_px for finger in seen.fingers for chain in finger.chains]
+    canvas = Canvas.about(image, np.concatenate(outlines), _WIDTH_PX)
+    labels = Labels(canvas.picture)
     for number, (finger, name) in enumerate(zip(seen.fingers, names, strict=True)):
         colour = _FINGERS[number % len(_FINGERS)]
         for edge in finger.inner:
@@ -33,15 +36,14 @@ def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Imag
             for a, b in chain.pieces:
                 canvas.line(chain.uv_px[[a, b]], colour)
             _draw_vertices(canvas, chain, colour)
-        centre = np.argwhere(finger.mask)[:, ::-1].mean(axis=0)
-        write(canvas.picture, name, canvas.pixel(centre), colour, 0.6)
+        vertices = np.concatenate([chain.uv_px for chain in finger.chains])
+        labels.put(name, canvas.pixel(vertices[np.argmin(vertices[:, 1])]), colour)
     unseen = np.vstack([np.zeros((0, 2)), *(border.unseen_px for border in seen.borders)])
     for at in unseen:
         canvas.circle(at, 1.5, _UNSEEN)
-    sigmas = np.concatenate([chain.sigma_px for finger in seen.fingers for chain in finger.chains])
     text = (
-        f"{len(seen.matte.kept)} images, outline to {np.median(sigmas):.3f} px (median), blur {seen.blur_px:.1f} px; "
-        f"red: 3 sigma, x {_ENLARGED:g}{'; pink dots: not seen' if len(unseen) else ''}"
+        f"{len(seen.matte.kept)} images, blur {seen.blur_px:.1f} px; "
+        f"red: 3 sigma of their scatter, x {_ENLARGED:g}{'; pink dots: not seen' if len(unseen) else ''}"
     )
     write(canvas.picture, text, (12, canvas.picture.shape[0] - 14), _TEXT, 0.5)
     return canvas.picture
@@ -53,6 +55,6 @@ def _draw_vertices(canvas: Canvas, chain: Chain, colour: Colour) -> None:
     for at, corner, matrix in zip(chain.uv_px, chain.corner.tolist(), covariance, strict=True):
         values, axes = np.linalg.eigh(matrix)
         reach: Array = 3.0 * _ENLARGED * np.sqrt(max(float(values[1]), 0.0)) * axes[:, 1]
-        reach = reach * min(1.0, 40.0 / max(float(np.linalg.norm(reach)), 1e-9))
+        reach = reach * min(1.0, 40.0 / canvas.zoom / max(float(np.linalg.norm(reach)), 1e-9))
         canvas.line(np.array([at - reach, at + reach]), _SCATTER)
         canvas.circle(at, 6.0 if corner else 2.5, _CORNER if corner else colour)
