@@ -21,7 +21,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
-from gripmon.model.records import Array, Frame, Image, ReferenceRecord
+from gripmon.model.records import Frame, Image, ReferenceRecord
 from gripmon.model.response import Response, ResponseSeen, response_of
 from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings
@@ -59,8 +59,6 @@ class Configured(Protocol):
     @property
     def reference(self) -> ReferenceRecord: ...
     @property
-    def cam_T_grip(self) -> Array: ...
-    @property
     def jaw_opening_m(self) -> float | None: ...
     @property
     def settings(self) -> _Settings: ...
@@ -71,29 +69,27 @@ class Configured(Protocol):
 @dataclass(frozen=True)
 class Teaching:
     """How every edge looks in the images (``taught``), and the ``model`` that a configuration names; ``images``: those
-    that were taught from; ``settings``: of the monitor, with the ``response`` of the camera.
+    that were taught from; ``rig``: what was taught, with the monitor's settings for the ``response`` of the camera.
     """
 
     taught: Taught
     model: TaughtModel
-    config: Configured
+    rig: Rig
+    reference: ReferenceRecord
     images: tuple[TeachingImage, ...]
-    settings: MonitorSettings
     response: ResponseSeen
 
     @property
     def edges(self) -> TaughtEdges:
         """What was taught, as the monitor uses it."""
-        gripper = self.config.gripper
-        return TaughtEdges.of_model(self.model, gripper, own_covariance(self.config.reference, gripper))
+        gripper = self.rig.gripper
+        return TaughtEdges.of_model(self.model, gripper, own_covariance(self.reference, gripper))
 
     def kept(self) -> tuple[Kept, Kept]:
         """What a monitor says over the images without what was taught, and with it."""
-        config, frames = self.config, as_frames(self.images)
-        untaught = Rig(config.camera, config.gripper, self.settings)
-        taught = untaught._replace(taught=self.edges)
-        before, after = (kept(rig, config.reference, frames) for rig in (untaught, taught))
-        return before, with_help(after, taught, lambda rig: kept(rig, config.reference, frames))
+        frames, taught = as_frames(self.images), self.rig._replace(taught=self.edges)
+        before, after = (kept(rig, self.reference, frames) for rig in (self.rig, taught))
+        return before, with_help(after, taught, lambda rig: kept(rig, self.reference, frames))
 
     def text(self) -> str:
         """The taught model's file (YAML)."""
@@ -101,18 +97,10 @@ class Teaching:
 
     def picture(self, ending: str = ".png") -> bytes:
         """The first image used, with what was taught drawn, offsets enlarged; ``ending``: .png, .jpg or .jpeg."""
-        config, first = self.config, self.images[0]
-        edges = TaughtEdges.of_model(self.model, config.gripper)
-        return picture_of(config.camera, config.gripper, config.cam_T_grip, first, edges, self.model, ending)
-
-
-def picture_of(
-    camera: Camera, gripper: Gripper, cam_T_grip: Array, first: TeachingImage, edges: TaughtEdges, model: TaughtModel,
-    ending: str,
-) -> bytes:  # fmt: skip
-    """The image with what was taught drawn, in the format of a file's ``ending``."""
-    drawn = draw_taught(camera, gripper, cam_T_grip, first, edges, model)
-    return bytes(cv2.imencode(ending, drawn)[1].tobytes())
+        camera, gripper, _, _ = self.rig
+        edges, pose = TaughtEdges.of_model(self.model, gripper), from_record(self.reference.cam_T_grip)
+        drawn = draw_taught(camera, gripper, pose, self.images[0], edges, self.model)
+        return bytes(cv2.imencode(ending, drawn)[1].tobytes())
 
 
 def teach(
@@ -149,18 +137,33 @@ def teach(
             right = f"--jaw-opening M, or jaw_opening_m in {Path(each.path).parent / TIMESTAMPS_NAME}"
             raise InputError(f"{each.path}: {wrong}; {right}")
     _check_different(pictures)
-    nominal_m = gripper.jaw_nominal_m
+    seen = told_response(pictures, response, settings.corners.edges.response if config.says_response else None)
+    rig = Rig(config.camera, gripper, settings.with_response(seen.response))
+    try:
+        return taught_from(pictures, rig, config.reference, seen, command)
+    except TeachingRefused as refused:
+        raise NoResultError(f"teach: {refused}", refused.notes) from None
+
+
+def taught_from(
+    pictures: Sequence[Picture],
+    rig: Rig,
+    reference: ReferenceRecord,
+    response: ResponseSeen,
+    command: str,
+    data: Mapping[str, bytes] = {},
+) -> Teaching:
+    """The same from pictures that are read; a jaw opening that isn't known counts as the nominal one.  ``rig``: with
+    the settings for the ``response``; ``data``: by path, images not yet written to files.  Raises
+    :class:`~gripmon.teach.views.TeachingRefused`.
+    """
+    nominal_m = rig.gripper.jaw_nominal_m
     shown = [
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures
     ]
-    seen = told_response(pictures, response, settings.corners.edges.response if config.says_response else None)
-    settings = settings.with_response(seen.response)
-    try:
-        taught = teach_images(Rig(config.camera, gripper, settings), config.reference, shown)
-    except TeachingRefused as refused:
-        raise NoResultError(f"teach: {refused}", refused.notes) from None
-    model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)
-    return Teaching(taught, model, config, tuple(taught.used(shown)), settings, seen)
+    taught = teach_images(rig, reference, shown)
+    model = _model(taught, rig, reference, pictures, command, data)
+    return Teaching(taught, model, rig, reference, tuple(taught.used(shown)), response)
 
 
 def told_response(pictures: Sequence[Picture], asked: str, configured: Response | None) -> ResponseSeen:
@@ -227,24 +230,24 @@ def _opening(path: Path, gripper: Gripper, opening_m: float | None) -> float | N
     return opening_m
 
 
-def taught_model(
+def _model(
     taught: Taught,
-    camera: Camera,
-    gripper: Gripper,
-    settings: MonitorSettings,
+    rig: Rig,
     reference: ReferenceRecord,
     pictures: Sequence[Picture],
     command: str,
-    data: Mapping[str, bytes] = {},
+    data: Mapping[str, bytes],
 ) -> TaughtModel:
-    """The model of what was taught, bound to its inputs.  ``data``: by path, images not yet written to files."""
+    """The model of what was taught, bound to its inputs."""
     images = []
     for picture in pictures:
         assert picture.path is not None, "an image has a file before it is taught from"
         content = data.get(picture.path) or Path(picture.path).read_bytes()
         digest = hashlib.sha256(content).hexdigest()
         images.append(TaughtImage(file=picture.path, sha256=digest, jaw_opening_m=picture.jaw_opening_m))
-    lens, model, stated_reference = identity(camera, gripper, reference.reference_id, from_record(reference.cam_T_grip))
+    lens, model, stated_reference = identity(
+        rig.camera, rig.gripper, reference.reference_id, from_record(reference.cam_T_grip)
+    )
     return TaughtModel(
         provenance=Provenance(
             gripmon=__version__,
@@ -261,7 +264,7 @@ def taught_model(
             images_covariance=taught.reference_covariance,
             play=taught.play,
         ),
-        edge_settings=settings.corners.edges,
+        edge_settings=rig.settings.corners.edges,
         edges=taught.edges,
         corners=taught.corners,
     )

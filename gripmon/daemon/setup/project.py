@@ -25,7 +25,7 @@ from gripmon.daemon.setup import entries, steps
 from gripmon.daemon.setup.capture import Capture
 from gripmon.daemon.setup.entries import target_in
 from gripmon.daemon.setup.lines import Line, findings, jaws, last_line
-from gripmon.daemon.setup.steps import BY_NAME, STEPS, Step, needed, own_camera, written
+from gripmon.daemon.setup.steps import BY_NAME, FIELDS, STEPS, Plan, Step, own_camera
 from gripmon.daemon.teaching.source import open_named
 from gripmon.io.sources import Source, Waiting
 from gripmon.io.wire.session import check_name
@@ -78,7 +78,7 @@ class Project:
     def keep(self, values: Mapping[str, str]) -> None:
         """Store a person's answers, even if they turn out wrong.  Raises :class:`InputError`."""
         for name in values:
-            if name not in steps.defaults():
+            if name not in FIELDS:
                 raise InputError(f"there is no field {name}")
         self.values |= {name: text.strip() for name, text in values.items()}
         self._write()
@@ -97,7 +97,7 @@ class Project:
         Raises :class:`InputError` for a step that takes no images.
         """
         name = "source" if step in (None, "camera") else f"{step}_source"
-        if name not in steps.defaults():
+        if name not in FIELDS:
             with_it = ", ".join(each.name for each in STEPS if each.name == "camera" or each.kind == "capture")
             raise InputError(f"the step {step} takes no images; one of {with_it}, or leave it out", "source")
         return name
@@ -122,8 +122,8 @@ class Project:
         lines = None if own is None else own()
         if lines is not None:
             return lines
-        words = step.command(self.values)
-        return [Line("nothing to do")] if words is None else self._command(words)
+        command = step.plan(self.values).command
+        return [Line("nothing to do")] if command is None or state.progress == "skipped" else self._command(command())
 
     def do_here(self, name: str, note: Callable[[str], object]) -> list[Line]:
         """As :meth:`do`, at a terminal: images are taken automatically; ``note`` is called with the result for each."""
@@ -159,46 +159,42 @@ class Project:
         return [Line(f"{len(capture.images())} images in {name}", "OK")]
 
     def _state(self, step: Step) -> StepState:
+        plan, words = step.plan(self.values), []
         try:
-            words = step.command(self.values)
+            if plan.command is not None and not plan.skipped:
+                words = plan.command()
         except InputError as error:
             return StepState(name=step.name, progress="waits", note=str(error), command="", files=())
-        files = written(step, self.values)
-        command = shlex.join(words or [])
+        command = shlex.join(words)
         if step.name == "teach":
             command = command.replace("'teaching/*.png'", "teaching/*.png")
-        progress, note = self._progress(step, files, needs_doing=words is not None)
-        if step.picture is not None:
-            files = (*files, step.picture)
+        progress, note = self._progress(step, plan)
+        files = plan.writes if step.picture is None else (*plan.writes, step.picture)
         present = tuple(name for name in files if (self.folder / name).exists())
         missing = self._missing(step) if progress == "waits" else None
         first = None if missing is None else missing[1].name
         return StepState(name=step.name, progress=progress, note=note, first=first, command=command, files=present)
 
-    def _progress(self, step: Step, files: tuple[str, ...], *, needs_doing: bool) -> tuple[Progress, str]:
-        inferred = step.name == "gripper" and self.values["gripper"] == entries.INFERRED
+    def _progress(self, step: Step, plan: Plan) -> tuple[Progress, str]:
+        inferred = plan.command is None
         if inferred or step.name in ("camera", "target"):
             done = self._accepted.get(step.name) == self._answers(step)
             return ("done", "the step Hand and eye makes its file" if inferred else "") if done else ("ready", "")
-        if not needs_doing:
-            by = "intrinsics_by" if step.name == "plate" else "reference_by"
-            return "skipped", f"{'lens' if step.name == 'plate' else 'reference'}: {self.values[by]}"
+        if plan.skipped:
+            return "skipped", plan.skipped
         missing = self._missing(step)
         if missing is not None:
             return "waits", f"first: {missing[1].title} ({missing[0]})"
         if step.kind == "capture":
             count = self._count(step.name)
             return ("done" if count else "ready"), f"{count} image{'' if count == 1 else 's'}"
-        if not all(self._there(name) for name in files):
+        if not all(self._there(name) for name in plan.writes):
             return "ready", ""
-        made = min(self._made_ns(name) for name in files)
-        newer = [name for name in needed(step, self.values) if self._made_ns(name) > made]
-        # An inferred gripper is made together with the hand/eye calibration.
-        newer = [name for name in newer if name not in files]
-        result = steps.measured_with_target(step, self.values)
-        if result is not None and not newer:
-            made_with, now = entries.made_with(self.folder / result), name_of(target_in(self.values))
-            if made_with != now and not (result == entries.LENS and entries.confirmed(self.values)):
+        made = min(self._made_ns(name) for name in plan.writes)
+        newer = [name for name in plan.needs if self._made_ns(name) > made]
+        if plan.measured is not None and not newer:
+            made_with, now = entries.made_with(self.folder / plan.measured), name_of(target_in(self.values))
+            if made_with != now and not (plan.measured == entries.LENS and entries.confirmed(self.values)):
                 return "stale", f"made with {made_with}, but the target is {now}: do this again"
         return ("stale", f"{newer[0]} is newer: do this again") if newer else ("done", "")
 
@@ -220,11 +216,11 @@ class Project:
 
     def _missing(self, step: Step) -> tuple[str, Step] | None:
         """The first missing file that a step needs, and the step that writes it."""
-        name = next((name for name in needed(step, self.values) if not self._there(name)), None)
+        name = next((name for name in step.plan(self.values).needs if not self._there(name)), None)
         if name is None:
             return None
         inferred = name == "gripper.yaml" and self.values["gripper"] == entries.INFERRED
-        makers = [each for each in STEPS if name in written(each, self.values)]
+        makers = [each for each in STEPS if name in each.plan(self.values).writes]
         return name, makers[-1 if inferred else 0]
 
     def _answers(self, step: Step) -> str:
@@ -275,7 +271,7 @@ class Project:
         if self.values["have"] == entries.PRINT_IT:
             bar_mm = print_target(target, self.values["paper"]).bar_mm
             self.values["bar_mm"] = f"{bar_mm:g}"
-            lines = self._command(BY_NAME["target"].command(self.values) or [])
+            lines = self._as_shown("target")
         else:
             self.values["bar_mm"] = ""
         lines.append(Line(f"the target is {name_of(target_in(self.values))}", "OK"))
@@ -283,28 +279,29 @@ class Project:
         return lines
 
     def _gripper(self) -> list[Line] | None:
-        words = BY_NAME["gripper"].command(self.values)
-        if words is None:
+        which = self.values["gripper"]
+        if which == entries.INFERRED:
             refuse_squares(target_in(self.values))
             lines = [jaws(self.values["jaw_range"]), Line("the step Hand and eye makes the gripper file", "OK")]
             self._accept("gripper")
             return lines
-        if self.values["gripper"] == entries.FROM_IMAGES:
-            return self._gripper_from_images(words)
-        if self.values["gripper"] == entries.FROM_CAD:
+        if which == entries.FROM_IMAGES:
+            return self._gripper_from_images()
+        if which == entries.FROM_CAD:
             # Its notes need a person's attention: edges that aren't taught, a small finger, an open surface.
-            lines, note = self._command(words), "note: "
+            lines, note = self._as_shown("gripper"), "note: "
             return [Line(e.text.removeprefix(note), "WARN") if e.text.startswith(note) else e for e in lines]
-        path = Path(words[1])
-        if not words[1] or not path.is_file():
-            raise InputError(f"{words[1] or 'the file'}: there is no such file; a gripper file such as the library's")
+        name = self.values["gripper_file"] if which == entries.FROM_FILE else str(steps.grippers().get(which, which))
+        path = Path(name)
+        if not name or not path.is_file():
+            raise InputError(f"{name or 'the file'}: there is no such file; a gripper file such as the library's")
         gripper = read_gripper(path)
         write_atomically(self.folder / "gripper.yaml", path.read_bytes())
         return [Line(f"{gripper.name}: {len(gripper.corner_ids)} corners, {len(gripper.edge_ids)} edges", "OK")]
 
-    def _gripper_from_images(self, words: list[str]) -> list[Line]:
+    def _gripper_from_images(self) -> list[Line]:
         """Existing images on the target stay the reference."""
-        lines = self._command(words)
+        lines = self._as_shown("gripper")
         if self.values["reference_by"] == entries.ON_PLATE and not self._count("standing"):
             self.keep({"reference_by": entries.BY_IMAGES})
             lines.append(
@@ -359,6 +356,12 @@ class Project:
         with contextlib.suppress(OSError, msgspec.DecodeError, KeyError):
             return findings(msgspec.json.decode((self.folder / "check.json").read_bytes())["findings"])
         return []
+
+    def _as_shown(self, step: str) -> list[Line]:
+        """Run the command that a step shows."""
+        command = BY_NAME[step].plan(self.values).command
+        assert command is not None
+        return self._command(command())
 
     def _command(self, words: list[str]) -> list[Line]:
         done = self._run(words)

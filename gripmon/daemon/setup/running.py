@@ -32,18 +32,13 @@ _ENDED = {0: "ended", 3: "ended: no usable frame", 4: "ended: another monitor ha
 
 
 class MonitorView(msgspec.Struct, frozen=True, kw_only=True):
-    """``verdict``, ``state``, ``reason`` and ``frame`` of the newest reply, ``bound`` on its position's error, as a
-    text, and ``mount``, how the camera stands; ``shown`` counts the pictures; ``lines`` of its log, the newest last;
-    ``ended``: how it ended, None while it runs or if it was never started.
+    """``record``: of the newest reply's frame; ``mount``: how the camera stands; ``shown`` counts the pictures;
+    ``lines`` of its log, the newest last; ``ended``: how it ended, None while it runs or if it was never started.
     """
 
     running: bool
     ended: str | None
-    verdict: str | None
-    state: str | None
-    reason: str | None
-    frame: int | None
-    bound: str | None
+    record: FrameRecord | None
     mount: MountView | None
     shown: int
     lines: tuple[str, ...]
@@ -99,17 +94,12 @@ class MonitorProcess:
 
     def seen(self) -> MonitorView:
         """For the page."""
-        process, record = self._process, self._record
+        process = self._process
         code = None if process is None else process.poll()
-        bound = None if record is None else record.protection
         return MonitorView(
             running=process is not None and code is None,
             ended=None if code is None else _ENDED.get(code, f"ended with exit code {code}"),
-            verdict=None if record is None else record.verdict.value,
-            state=None if record is None else record.state.value,
-            reason=None if record is None else record.reason,
-            frame=None if record is None else record.seq,
-            bound=None if bound is None else f"{1e3 * bound.position_m:.2f} mm",
+            record=self._record,
             mount=self._mount,
             shown=self._shown,
             lines=tuple(self._lines),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,7 +16,7 @@ from gripmon.daemon.setup.capture import Capture, CaptureState
 from gripmon.daemon.setup.lines import Line
 from gripmon.daemon.setup.project import VIEW, Project, StepState
 from gripmon.daemon.setup.running import MonitorProcess, MonitorView
-from gripmon.daemon.setup.steps import STEPS, grippers
+from gripmon.daemon.setup.steps import STEPS
 from gripmon.daemon.teaching import outline_page, page_session, read_inputs
 from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.targets import OtherSizeError
@@ -48,18 +48,6 @@ class CaptureOrder(Request, frozen=True):
     name: Annotated[str, Meta(max_length=200)] = ""
 
 
-class FieldState(msgspec.Struct, frozen=True, kw_only=True):
-    """``box``: text of a box to tick, which is the value then; None: another field."""
-
-    name: str
-    label: str
-    value: str
-    hint: str
-    choices: tuple[str, ...]
-    only: tuple[str, tuple[str, ...]] | None
-    box: str | None
-
-
 class StepCard(msgspec.Struct, frozen=True, kw_only=True):
     """The constant and the changing part of a step; ``picture``: its newest picture's address; ``said``: output of the
     last run; ``error``: why it failed.
@@ -70,16 +58,21 @@ class StepCard(msgspec.Struct, frozen=True, kw_only=True):
     kind: str
     button: str
     picture: str | None
-    fields: tuple[FieldState, ...]
+    fields: tuple[steps.Field, ...]
     state: StepState
     said: tuple[Line, ...]
     error: str
 
 
 class SetupState(msgspec.Struct, frozen=True, kw_only=True):
-    """``busy``: the step being carried out; ``capture``: of the step ``capturing``, whose camera runs or ran last."""
+    """``values`` of all fields; ``boxes``: of those that are boxes to tick the text, which is their value then, empty
+    where there is nothing to confirm; ``busy``: the step being carried out; ``capture``: of the step ``capturing``,
+    whose camera runs or ran last.
+    """
 
     folder: str
+    values: dict[str, str]
+    boxes: dict[str, str]
     busy: str | None
     steps: tuple[StepCard, ...]
     capturing: str | None
@@ -146,6 +139,8 @@ class SetupSite:
         states = self._project.states()
         return SetupState(
             folder=str(self._project.folder),
+            values=dict(self._project.values),
+            boxes={name: self._box(asked) for name, asked in steps.BOXES.items()},
             busy=self._busy,
             steps=tuple(self._card(step, state) for step, state in zip(STEPS, states, strict=True)),
             capturing=None if capturing is None else capturing[0],
@@ -154,17 +149,8 @@ class SetupSite:
         )
 
     def _card(self, step: steps.Step, state: StepState) -> StepCard:
-        values = self._project.values
-        fields = tuple(
-            FieldState(
-                name=field.name, label=field.label, value=values[field.name], hint=field.hint,
-                choices=self._choices(field), only=field.only, box=box,
-            )
-            for field in step.fields
-            if (box := self._box(field)) != ""
-        )  # fmt: skip
         return StepCard(
-            title=step.title, about=step.about, kind=step.kind, button=step.button, fields=fields, state=state,
+            title=step.title, about=step.about, kind=step.kind, button=step.button, fields=step.fields, state=state,
             picture=self._picture(step), said=self._said.get(step.name, ()), error=self._errors.get(step.name, ""),
         )  # fmt: skip
 
@@ -176,18 +162,10 @@ class SetupSite:
             return f"file/{step.picture}?{(self._project.folder / step.picture).stat().st_mtime_ns}"
         return None
 
-    @staticmethod
-    def _choices(field: steps.Field) -> tuple[str, ...]:
-        if field.name != "gripper":
-            return field.choices
-        return (*field.choices, *grippers())
-
-    def _box(self, field: steps.Field) -> str | None:
-        """Text of the field's box; None for another field, empty if there is nothing to confirm or no target yet."""
-        if field.asks is None:
-            return None
+    def _box(self, asked: Callable[[entries.Values], str]) -> str:
+        """Text of a box; empty if there is nothing to confirm, or no target yet."""
         with contextlib.suppress(InputError):
-            return field.asks(self._project.values)
+            return asked(self._project.values)
         return ""
 
     def _do(self, order: StepRequest) -> None:

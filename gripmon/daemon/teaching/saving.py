@@ -20,16 +20,16 @@ from gripmon.daemon.teaching.written import config_text
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.geometry import from_record
 from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
 from gripmon.model.yaml_text import yaml_value
-from gripmon.teach.api import Picture, picture_of, taught_model, to_yaml, told_response
+from gripmon.teach.api import Picture, taught_from, to_yaml, told_response
 from gripmon.teach.messages import CornersRequest, Evaluation, Saved, SaveOrder, SavingRefused
 from gripmon.teach.session import Labels, TeachSession
 from gripmon.teach.snapping import FEWEST_PUT
-from gripmon.teach.views import TeachingImage, TeachingRefused
-from gripmon.track.edges import TaughtEdges, TaughtModel
+from gripmon.teach.views import TeachingRefused
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = FILES["taught"], FILES["config"], "corners.yaml", "teaching"
 
@@ -88,7 +88,7 @@ class FileSaving:
             raise SavingRefused(f"{found.no_reference}; or save the corners only")
         model = None
         if order.taught and reference is not None:
-            model, notes = self._taught(order, found, reference, pictures, files)
+            model, notes = self._taught(order, found, reference, pictures, files, light)
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
             texts["config"] = self._config(order, found, model is not None)
@@ -142,27 +142,20 @@ class FileSaving:
         reference: ReferenceRecord,
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
+        light: ResponseSeen,
     ) -> tuple[TaughtModel, list[str]]:
         setup, opening_m = self._inputs.setup, found.snapped.jaw_opening_m
         given = order.put.jaw_opening_m is not None
         pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
-        nominal_m = setup.gripper.jaw_nominal_m
-        images = [
-            TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, p.name) for p in pictures
-        ]
+        rig = Rig(setup.camera, setup.gripper, setup.settings)
         try:
-            taught, _ = setup.taught(reference, images)
+            teaching = taught_from(pictures, rig, reference, light, self._inputs.command, files)
         except TeachingRefused as refused:
             why = f"no taught model: {refused}; or save without it: on the page untick it"
             raise SavingRefused(why, refused.notes) from None
+        self.picture, taught = teaching.picture, teaching.taught
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
-        model = taught_model(
-            taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files
-        )
-        pose, first = from_record(reference.cam_T_grip), taught.used(images)[0]
-        edges = TaughtEdges.of_model(model, setup.gripper)
-        self.picture = lambda ending: picture_of(setup.camera, setup.gripper, pose, first, edges, model, ending)
-        return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
+        return teaching.model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
     def _corners(self, order: SaveOrder, found: Evaluation, image: str) -> str:
         """Corners as ``--corners`` reads them."""

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gripmon.model.records import Array
+from gripmon.teach.cad.files import mesh_library
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -146,16 +147,10 @@ def shading_of(surface: Surface) -> Shading:
     key = surface.patch[:, None] * np.intp(len(surface.points_m)) + triangles
     _, corner = np.unique(key, return_inverse=True)
     corner = corner.reshape(-1, 3)
-    places = surface.points_m[triangles]
-    out, back = np.roll(places, -1, axis=1) - places, np.roll(places, 1, axis=1) - places
-    lengths = np.linalg.norm(out, axis=2) * np.linalg.norm(back, axis=2)
-    angle = np.arccos(np.clip(np.einsum("tki,tki->tk", out, back) / lengths, -1.0, 1.0))
-    normals = np.zeros((int(corner.max(initial=-1)) + 1, 3))
-    for k in range(3):
-        weighted = angle[:, k, None] * surface.normals
-        for i in range(3):
-            normals[:, i] += np.bincount(corner[:, k], weighted[:, i], minlength=len(normals))
-    return Shading(corner, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None])
+    trimesh = mesh_library("a surface")
+    angles = trimesh.triangles.angles(surface.points_m[triangles])
+    count = int(corner.max(initial=-1)) + 1
+    return Shading(corner, trimesh.geometry.weighted_vertex_normals(count, corner, surface.normals, angles))
 
 
 def radius_m(places: Array, normals: Array, direction: Array) -> Array:

@@ -30,11 +30,11 @@ const step = () => state.steps.find((each) => each.state.name === chosen);
 const capture = () => (state.capturing === chosen ? state.capture : null);
 const taking = () => Boolean(capture()?.running && !capture().ended);
 // What is entered and not yet used: the server keeps it without blanks.
-const entered = () => step().fields.some(({ name, value }) => name in typed && typed[name].trim() !== value);
-// The values of this step, and those typed before and not yet sent: they count, too.
-const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map((field) => [field.name, typed[field.name] ?? field.value])) });
+const entered = () => step().fields.some(({ name }) => name in typed && typed[name].trim() !== state.values[name]);
 // Of all steps: what is asked may depend on another one's.
-const everything = () => ({ ...Object.fromEntries(state.steps.flatMap((each) => each.fields).map((field) => [field.name, field.value])), ...said() });
+const everything = () => ({ ...state.values, ...typed });
+// The values of this step, and those typed before and not yet sent: they count, too.
+const said = () => ({ ...typed, ...Object.fromEntries(step().fields.map(({ name }) => [name, everything()[name]])) });
 
 function choose(name) {
   chosen = name;
@@ -72,7 +72,7 @@ function changed(name, value) {
   showStatus();
 }
 
-function tickBox({ name, label: title, box, hint }, ticked) {
+function tickBox({ name, label: title, hint }, box, ticked) {
   const label = element("label", "", { class: "check" }), text = element("span"), input = element("input", "", { type: "checkbox", name });
   input.checked = ticked;
   input.addEventListener("input", () => changed(name, input.checked ? box : ""));
@@ -84,10 +84,10 @@ function tickBox({ name, label: title, box, hint }, ticked) {
 
 // The server's answers must not overwrite what a person is typing.
 function showFields() {
-  const { fields } = step(), now = everything();
-  const asked = fields.filter(({ only }) => !only || only[1].includes(now[only[0]]));
-  redraw($("#fields"), [chosen, asked.map(({ name, choices, box }) => [name, choices, box])], () => asked.map((field) => {
-    if (field.box) return tickBox(field, now[field.name] === field.box);
+  const now = everything(), { boxes } = state;
+  const asked = step().fields.filter(({ name, only }) => (only ? only[1].includes(now[only[0]]) : boxes[name] !== ""));
+  redraw($("#fields"), [chosen, asked.map(({ name }) => [name, boxes[name]])], () => asked.map((field) => {
+    if (boxes[field.name]) return tickBox(field, boxes[field.name], now[field.name] === boxes[field.name]);
     const label = element("label", field.label);
     const input = element(field.choices.length ? "select" : "input", "", { name: field.name, spellcheck: "false" });
     for (const choice of field.choices) input.append(element("option", choice, { value: choice }));
@@ -108,7 +108,7 @@ function button(text, act, kind, id, can = true) {
 
 function buttonsOf({ kind, button: name, state: { progress } }) {
   const now = capture(), order_ = (action) => () => post("capture", { step: chosen, action });
-  const skips = chosen === "standing" && said().reference_by !== "on the plate";
+  const skips = chosen === "standing" && everything().reference_by !== "on the plate";
   const copies = everything()[{ intrinsics: "intrinsics_by", reference: "reference_by" }[chosen]] === "a file";
   if (kind === "form" || skips) return [button(skips || copies ? "Use it" : name, () => post("do", { step: chosen, values: said() }), "main", "step")];
   if (kind === "page") {
@@ -153,10 +153,12 @@ function status() {
   if (wrong) return [wrong, "bad"];
   if (chosen === "run" && (monitor.running || monitor.ended)) {
     const last = monitor.lines.at(-1) ?? "";
-    if (monitor.verdict === null) return monitor.running ? [last || "starting …", ""] : [last ? `${monitor.ended}: ${last}` : monitor.ended, "bad"];
-    const why = monitor.reason ? `: ${monitor.reason}` : "", bound = monitor.bound ? `, error at most ${monitor.bound}` : "";
-    const text = `transform ${monitor.verdict}${why}${bound}; ${monitor.state}; frame ${monitor.frame}`;
-    return [monitor.running ? text : `${monitor.ended}; last: ${text}`, monitor.verdict === "valid" ? "good" : "warn"];
+    const seen = monitor.record;
+    if (!seen) return monitor.running ? [last || "starting …", ""] : [last ? `${monitor.ended}: ${last}` : monitor.ended, "bad"];
+    const why = seen.reason ? `: ${seen.reason}` : "", { protection } = seen;
+    const bound = protection ? `, error at most ${(1e3 * protection.position_m).toFixed(2)} mm` : "";
+    const text = `transform ${seen.verdict}${why}${bound}; ${seen.state}; frame ${seen.seq}`;
+    return [monitor.running ? text : `${monitor.ended}; last: ${text}`, seen.verdict === "valid" ? "good" : "warn"];
   }
   if (camera && (camera.running || camera.ended)) return [camera.ended ? camera.note : `${camera.note}; ${camera.images.length} taken`, /^(taken|ready|no more)/.test(camera.note) ? "good" : "warn"];
   if (now.progress === "done" && own && entered()) return [`changed: press “${own}”`, ""];
