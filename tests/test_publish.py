@@ -127,6 +127,7 @@ def test_a_port_that_is_taken_is_said_with_its_key(publisher: Published, endpoin
     said = str(caught.value)
     assert said.startswith("publish.listen: can't open a Zenoh session: ") and "\n" not in said
     assert endpoint in said and "Address already in use" in said
+    assert "each monitor on this computer listens on a port of its own, such as tcp/127.0.0.1:7448, or all" in said
 
 
 def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str):

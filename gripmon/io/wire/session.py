@@ -107,10 +107,16 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
         keys = [key for key in ("listen", "connect") if getattr(settings, key)]
         if settings.zenoh_config is not None:
             keys = ["zenoh_config"]
-        raise PublishError(" or publish.".join(keys), f"can't open a Zenoh session: {zenohs_words(error)}") from error
+        said = zenohs_words(error)
+        right = _ANOTHER_PORT if "Address already in use" in said else ""
+        raise PublishError(" or publish.".join(keys), f"can't open a Zenoh session: {said}{right}") from error
 
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_ANOTHER_PORT = (
+    "; each monitor on this computer listens on a port of its own, such as tcp/127.0.0.1:7448, or all connect to a "
+    "router (gripmon router, publish.mode: client)"
+)
 _ENDPOINT_PATTERN = (
     r"^((tcp|udp|tls|quic|ws)/(\[[^\]\s]+\]|[^:/\[\]\s]+):(?P<port>\d{1,5})([?#]\S*)?"
     r"|(serial|unixsock-stream|unixpipe|vsock)/\S+)(?![\s\S])"
