@@ -18,27 +18,22 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
 from gripmon.monitor.anchor import Anchor
-from gripmon.monitor.bounds import Cases, TwoDoubts, bounds_of, doubts_since, larger, reaching, unbounded
+from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import AtReferences, Bounds, Differences
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Knocks, Mount, bounds
+from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
-
-NOT_AS_EXPECTED = (
-    "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where the "
-    "reference has it"
-)
 
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
@@ -54,6 +49,11 @@ LEAST_WEIGHT_RATIO = 1e-3
 
 class Weigher:
     """Protection levels of one monitor's measurements, and the anchor that they rest on."""
+
+    not_as_expected = (
+        "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where "
+        "the reference has it"
+    )
 
     def __init__(
         self,
@@ -75,6 +75,8 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
+        self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
+        self._axis = tracker.finger_axis
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
@@ -173,13 +175,11 @@ class Weigher:
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
-        without = self._without_ends(measurement, fits, besides, displaced)
-        wrong, left_out = self._knocked_cases(fits, without, cam_T_grip, prior, knocks, odds)
-        cases = Cases.together([fits.cases(cam_T_grip, prior, anchored).among(fits.stays), *wrong])
-        differences = self._differences(fits, cam_T_grip)
-        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), doubts_since(cases, differences))
-        doubts = self._with_lasting(doubts, fits, differences, cam_T_grip, displaced, now_s, knocks)
-        both = self._with_questions(bounds_of(doubts, risk, left_out), cam_T_grip, displaced)
+        without = self._without_ends(fits, besides, displaced)
+        wrong = self._knocks_under(fits, without, prior, knocks, odds)
+        stayed = fits.cases(fits.away(cam_T_grip), prior, fits.stays, anchored)
+        both = self._bounds(stayed, wrong, fits, cam_T_grip, displaced, now_s, knocks)
+        both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
@@ -242,58 +242,74 @@ class Weigher:
             absolute = larger(absolute, self._not_as_expected(self.unexplained))
         return both._replace(absolute=absolute)
 
-    def _with_lasting(
+    def _bounds(
         self,
-        doubts: TwoDoubts,
+        stayed: Cases,
+        wrong: list[tuple[Refits, Knocked]],
         fits: Refits,
-        differences: Differences | None,
         cam_T_grip: Array,
         displaced: bool,
         now_s: float,
         knocks: Knocks,
-    ) -> TwoDoubts:
-        """The doubts with those of what may have been wrong all along, or in the reference's frames."""
-        anchor, since, lasting = self.anchor, list[Cases](), list[NDArray[np.intp]]()
-        ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
-        prior = self._lasting.priors(ever)
-        every = np.arange(len(prior))
+    ) -> Bounds:
+        """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
+        is as known, ``stayed``, and after the knocks that are ``wrong``, with what may have been wrong all along, or in
+        the reference's frames alone.
+        """
+        risk, anchor, (first, _) = self._policy.integrity_risk, self.anchor, fits.model.first
+        lasting, every = self._lasting, np.arange(len(self._lasting.name))
+        ever, since = list[Cases](), list[tuple[Cases, NDArray[np.intp]]]()
         if anchor is not None and not displaced:
-            rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
-            absolute, told = anchor.cases(cam_T_grip, fits, rows, wander, prior)
-            doubts = replace(doubts, absolute=doubts.absolute + fits.model.absolute(absolute, cam_T_grip))
-            since, lasting = [told], [every]
-        if differences is not None:
-            anchored = None if displaced else fits.anchored
-            at_first = self._lasting.priors(self._since.misread)
-            since.append(fits.wrong_at_first(self._lasting.name, at_first, cam_T_grip, anchored))
-            lasting.append(every[1:])
-        if not since:
-            return doubts
+            rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
+            absolute, without_origin = anchor.cases(cam_T_grip, fits, rows, self._wander(now_s), prior)
+            ever, since = [absolute], [(without_origin, every)]
+        if first is not None:
+            anchored, prior = None if displaced else fits.anchored, lasting.priors(first.misread)
+            since.append((fits.wrong_at_first(lasting.name, prior, stayed.away, anchored), every[1:]))
+        left_out, count = 0.0, len(stayed.prior) + 2 * len(every)
+        for _, found in wrong:
+            left_out, count = left_out + found.left_out, count + len(found.prior)
+        # Of what isn't probable enough to have a bound, whichever, the prior counts alone.
+        now = [stayed, *(of.after(stayed.away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
+        of_motion = self._of_motion(now, since, fits, cam_T_grip, knocks, displaced)
+        absolutely = fits.model.absolute([*now, *ever], cam_T_grip)
+        return Bounds(protection_of(absolutely, risk, left_out), protection_of(of_motion, risk, left_out))
+
+    def _of_motion(
+        self,
+        now: list[Cases],
+        lasting: list[tuple[Cases, NDArray[np.intp]]],
+        fits: Refits,
+        cam_T_grip: Array,
+        knocks: Knocks,
+        displaced: bool,
+    ) -> Doubts:
+        """The doubts about the motion since the reference, of what is wrong ``now``, and of what may have been in its
+        frames, with the numbers of the ``lasting`` hypotheses.  Of a mount that vibrates the average of the reference's
+        frames and its place at their stamp differ by that.
+        """
+        differences = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+        if differences is None:  # this frame is the first one
+            return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
         staying = self._staying(knocks, displaced)
-        more = doubts_since(Cases.together(since), differences, np.concatenate(lasting), staying)
-        return replace(doubts, since=doubts.since + more)
+        stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
+        return Doubts((*map(differences.of, now), *stayed), SIGMA_INFLATION)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
         ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
-        axis = cam_T_grip[:3, :3] @ self._tracker.finger_axis
+        axis = cam_T_grip[:3, :3] @ self._axis
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
-
-    def _differences(self, fits: Refits, cam_T_grip: Array) -> Differences | None:
-        """What makes fits near a pose (4, 4) those of the motion since the reference's frames; None before these.  Of a
-        mount that vibrates their average and its place at their stamp differ by that.
-        """
-        found = fits.model.differences(cam_T_grip, fits.opened)
-        return None if found is None else found._replace(more=found.more + np.diag(self.swing))
 
     def _staying(self, knocks: Knocks, displaced: bool) -> Array:
         """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
         """
-        return self._usual_motion + knocks.spread if displaced or self._since.knocked else self._usual_motion
+        moved = displaced or (self._since.current is not None and self._since.current.knocked)
+        return self._usual_motion + knocks.spread if moved else self._usual_motion
 
     @property
     def _usual_motion(self) -> Array:
@@ -311,7 +327,7 @@ class Weigher:
         covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
         return _contradicts(way, covariance)
 
-    def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
+    def _without_ends(self, fits: Refits, besides: float, displaced: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
         probability ``besides``, doesn't count.
         """
@@ -319,36 +335,22 @@ class Weigher:
             return fits
         if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
             return None
-        hypotheses = self._possible.about(fits.edges).without_ends
-        floor = self._tracker.floor_of(measurement)
-        return Refits(measurement, hypotheses, floor, fits.model, fits.known, together=False)
+        return fits.under(self._possible.about(fits.edges).without_ends)
 
-    def _knocked_cases(
-        self,
-        fits: Refits,
-        without: Refits | None,
-        cam_T_grip: Array,
-        prior: Array,
-        knocks: Knocks,
-        odds: tuple[float, float],
-    ) -> tuple[list[Cases], float]:
-        """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
+    def _knocks_under(
+        self, fits: Refits, without: Refits | None, prior: Array, knocks: Knocks, odds: tuple[float, float]
+    ) -> list[tuple[Refits, Knocked]]:
+        """The knocks that the mount may have got since it was last known, by the fits and by those without the ends.
         ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
         """
         ends = fits.hypotheses.ends
         if without is fits:  # then that of the ends is the same as that nothing is wrong
             prior = prior * (np.arange(len(prior)) != ends)
-        cases, left_out = fits.knocked(cam_T_grip, prior, knocks, odds, self._least)
-        if without is None or without is fits:
-            return [cases], left_out
-        both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
-        more, more_out = without.knocked(cam_T_grip, both, knocks, odds, self._least)
-        return [cases, more], left_out + more_out
-
-    @property
-    def _least(self) -> float:
-        """Probability below which a knock under a hypothesis isn't solved."""
-        return LEAST_WEIGHT_RATIO * self._policy.integrity_risk
+        found = [(fits, fits.knocked(prior, knocks, odds, self._least))]
+        if without is not None and without is not fits:
+            both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
+            found.append((without, without.knocked(both, knocks, odds, self._least)))
+        return found
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
@@ -435,17 +437,19 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        cases = fits.cases(cam_T_grip, fits.hypotheses.prior)
-        since = doubts_since(cases, self._differences(fits, cam_T_grip))
-        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), since)
-        both = bounds_of(doubts, self._policy.integrity_risk)
-        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
+        cases = fits.cases(fits.away(cam_T_grip), fits.hypotheses.prior, np.ones(len(fits.stays), dtype=np.bool_))
+        if self._policy.valid_by is ValidBy.ABSOLUTE:
+            doubts = fits.model.absolute([cases], cam_T_grip)
+        else:
+            found = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+            doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
+        return past_alert_limit(protection_of(doubts, self._policy.integrity_risk), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
         risk = self._policy.integrity_risk
         position_m, rotation_rad = _radii(self._expected[1], risk)
-        why = NOT_AS_EXPECTED
+        why = self.not_as_expected
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:

@@ -43,9 +43,6 @@ occlusion, since the average rate of knocks is too low for both (docs/integrity.
 """
 
 
-_ANYWHERE = np.stack([np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M])
-
-
 def log_likely(shift_m: Array) -> Array:
     """(n,) natural logarithms of how likely knocks in any direction shift the TCP by ``shift_m`` (n, 3), over that of
     no shift at all.
@@ -68,20 +65,27 @@ class Knocks(NamedTuple):
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        length = float(np.linalg.norm(axis_cam))
+        length, kinds = float(np.linalg.norm(axis_cam)), len(ANY_SHARE)
         if length == 0.0:
-            return cls(np.array(ANY_SHARE), _ANYWHERE, np.zeros(len(ANY_SHARE), dtype=np.bool_))
-        count = len(ANY_SHARE) + len(ALONG_SHARE)
-        covariance, way = np.zeros((count, 6, 6)), axis_cam / length
-        covariance[: len(ANY_SHARE)] = _ANYWHERE
-        covariance[len(ANY_SHARE) :, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * np.outer(way, way)
-        share = [(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]
-        return cls(np.concatenate(share), covariance, np.arange(count) >= len(ANY_SHARE))
+            return cls(np.array(ANY_SHARE), _BY_KIND.covariance[:kinds], _BY_KIND.along[:kinds])
+        covariance, way = _BY_KIND.covariance.copy(), axis_cam / length
+        covariance[kinds:, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
+        return _BY_KIND._replace(covariance=covariance)
 
     @property
     def spread(self) -> Array:
         """(6, 6) covariance of the motion by any knock."""
         return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
+
+
+_BY_KIND = Knocks(
+    np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]),
+    np.stack(
+        [np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M]
+        + [np.zeros((6, 6))] * len(ALONG_SHARE)  # by the fingers' direction
+    ),
+    np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
+)
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
@@ -102,15 +106,13 @@ class Mount:
         """
         self._creep, self._jumps_per_s = creep, jumps_per_month / (30.0 * 86_400.0)
         self._swing: Array = np.square(play)
-
-    @property
-    def swing(self) -> Array:
+        self.swing: Array = self._swing
         """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
-        return np.maximum(self._swing, 0.0)
 
     def learn(self, way: Array, noise: Array) -> None:
         """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
         self._swing = swinging(self._swing, way, noise)
+        self.swing = np.maximum(self._swing, 0.0)
 
     def creep(self, elapsed_s: float) -> Array:
         """(6,) variance of the slow motion in a time; a clock that was set back is no time."""
