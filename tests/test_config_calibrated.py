@@ -139,12 +139,12 @@ def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):
         (CAM, lambda v: v.update(covariance=[1.0, 2.0]), "camera.yaml: covariance: has 2 values for 1 parameters"),
         (CAM, lambda v: v["camera"].update(fx_px=-1.0), "camera.yaml: camera.fx_px: "),
         (CAM, lambda v: v["camera"].update(focal=9.0), "camera.yaml: camera.focal: unknown key"),
-        (CAM, lambda v: v["camera"].update(fx_px=970.0), "hand_eye.yaml: camera: isn't the configuration's"),
+        (CAM, lambda v: v["camera"].update(fx_px=970.0), "hand_eye.yaml: camera: isn't the camera that is given"),
         ("gripper.yaml", lambda v: v["points"]["L_in_far"].update(xyz_m=[-0.0171, 0.008, 0.0]),
          "hand_eye.yaml: gripper: is two_box_fingers with other contents"),
         (HE, lambda v: v["gripper"].update(name="other", sha256="0" * 64), "gripper: is other, the"),
         ("gripper.yaml", lambda v: v.update(name="renamed"),
-         ("gripper: is two_box_fingers, the configuration has renamed, the same except for its name; "
+         ("gripper: is two_box_fingers, the one given is renamed, the same except for its name; "
           "name: two_box_fingers in the gripper file")),
         (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.0, 0.0, -0.1]),
          "hand_eye.yaml: cam_T_grip.translation_m: puts the TCP behind the camera"),

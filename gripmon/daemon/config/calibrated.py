@@ -116,11 +116,11 @@ def mismatch(
     it does.
     """
     if made_camera not in (None, camera):
-        return Fault("camera", "isn't the configuration's camera", "the hand/eye calibration made with the same camera")
+        return Fault("camera", "isn't the camera that is given", "the hand/eye calibration made with the same camera")
     if made is not None and made.sha256 != gripper_digest(gripper):
         name = made.name
         same = " with other contents" if name == gripper.name else ""
-        wrong = f"is {name}{same}, the configuration has {gripper.name}"
+        wrong = f"is {name}{same}, the one given is {gripper.name}"
         right = "the hand/eye calibration made with the same gripper file; gripmon calibrate plane makes it again"
         if made.sha256 == gripper_digest(gripper, name):
             wrong, right = f"{wrong}, the same except for its name", f"name: {name} in the gripper file"

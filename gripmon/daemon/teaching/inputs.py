@@ -196,9 +196,7 @@ def _calibrations(
         reference = configured(found.cam_T_grip, found.covariance, with_gripper=found.with_gripper)
         fault = None if given is None else mismatch(found.lens, found.gripper, given.lens, gripper)
         if fault is not None:
-            wrong = fault.wrong.replace("the configuration's camera", "the one given")
-            wrong = wrong.replace("the configuration has", "the one given is")
-            raise InputError(f"{found.name}: {fault.key}: {wrong}; {fault.right}", "reference")
+            raise InputError(f"{found.name}: {fault.key}: {fault.wrong}; {fault.right}", "reference")
     if given is None:
         right = "a file of gripmon calibrate intrinsics, or a configuration"
         raise InputError(f"is missing; {right}", "camera")
