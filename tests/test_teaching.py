@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from support.meters import box_gripper, moved
@@ -24,12 +25,15 @@ from support.taught_scenes import (
 )
 
 from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor
 from gripmon.simulate.solids import finger_solids
 from gripmon.teach.accuracy import forecast_frame
+from gripmon.teach.measure import teach
 from gripmon.teach.play import with_play
 from gripmon.teach.views import TeachingImage, TeachingRefused, Viewer
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
 from gripmon.track.edges.taught import sight_axes
 
@@ -301,6 +305,21 @@ def test_the_play_of_the_images_is_taught_and_no_knock_to_a_monitor():
             monitor.process(Frame(k, k * 10**9, image, OPENING_M))
         ended = monitor.state().at_reference or ()  # of the first frames, which are averaged until the mount is knocked
         assert [at.knocked for at in ended] == [True] * knocked
+
+
+def test_an_edge_that_lies_farther_beside_the_others_than_bevels_differ_is_named():
+    """The reference is so uncertain that it isn't refused: a file whose outer border is 0.4 mm off."""
+    model = msgspec.to_builtins(contents_of(box_gripper().model))
+    for name, point in model["points"].items():
+        if name in ("L_out_near", "L_out_near_back"):
+            x, y, z = point["xyz_m"]
+            point["xyz_m"] = (x + 4e-4, y, z)
+    off = Gripper(msgspec.convert(model, type(box_gripper().model)))
+    images = [TeachingImage(image_of(0.0, scene(dn)), OPENING_M, f"{dn}") for dn in (150.0, 165.0, 195.0, 210.0)]
+    taught = teach(Rig(CAMERA, off, RIG.settings), reference(None, 1e-3, 1e-2), images)
+    named = [note for note in taught.notes if "beside the other" in note]
+    assert len(named) == 1 and named[0].startswith("L_out_near_along appears 0.3"), taught.notes
+    assert not any("beside the other" in note for note in taught_from(image_of(0.0)).notes)
 
 
 @pytest.mark.parametrize(("size_px", "play"), [(1.6, True), (2.6, False)])

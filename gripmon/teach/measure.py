@@ -17,11 +17,13 @@ from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
+from scipy.stats import norm
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import ReferenceRecord
 from gripmon.teach.estimate import (
+    PLAUSIBLE_OWN_M,
     SHAPE_M,
     EdgeLines,
     check_edges,
@@ -176,7 +178,7 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
         edges,
         _corners(viewer, arrays, images[0].jaw_opening_m),
         {**untaught, **lost},
-        notes,
+        (*notes, *_strays(viewer, lines, edges)),
         round(_closure_px(viewer, images, arrays), 4),
         reference.offset,
         reference.covariance,
@@ -290,6 +292,37 @@ def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: s
         named = ", ".join(f"{viewer.gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())
         notes.append(f"another line runs beside {named}: teach from several images with different backgrounds")
     return tuple(notes)
+
+
+STRAY_PROBABILITY = 1e-3
+"""Of a note about an edge in a teaching in which none strays."""
+
+
+def _strays(viewer: Viewer, lines: Mapping[int, EdgeLines], edges: Mapping[str, TaughtEdge]) -> list[str]:
+    """Edges that appear farther beside the others of their kind, outlines or creases, than bevels differ by chance:
+    another line may have been taken for them.
+    """
+    names = viewer.gripper.edge_ids
+    of_kind: dict[str, dict[int, float]] = {"outlines": {}, "creases": {}}
+    for index, edge in lines.items():
+        if edge.images:
+            own, kind = edges[names[index]], "creases" if edges[names[index]].crease else "outlines"
+            # Towards the finger, as bevels move all outlines alike.
+            side = float(viewer.inside[index]) if kind == "outlines" else 1.0
+            of_kind[kind][index] = side * float(np.mean(own.offset_m))
+    notes = []
+    for kind, own_m in of_kind.items():
+        values_m = np.array([*own_m.values(), 0.0])
+        middle_m = float(np.median(values_m))
+        usual_m = max(1.4826 * float(np.median(np.abs(values_m - middle_m))), PLAUSIBLE_OWN_M)
+        for index, away_m in ((index, abs(m - middle_m)) for index, m in own_m.items()):
+            if away_m > usual_m * norm.isf(0.5 * STRAY_PROBABILITY / len(own_m)):
+                px = lines[index].sampled.per_m * away_m
+                notes.append(
+                    f"{names[index]} appears {1e3 * away_m:.2f} mm ({px:.1f} px) beside the other {kind}, which differ "
+                    f"by {1e3 * usual_m:.2f} mm: another line may have been taken for it; see it in --picture"
+                )
+    return notes
 
 
 AGREEING_SHARE = 0.95
