@@ -21,7 +21,6 @@ from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import foreign_camera, read_camera
 from gripmon.daemon.config.checks import covariance_of
-from gripmon.daemon.config.project import files_of
 from gripmon.daemon.config.robot_file import (
     at_flange,
     frame_without_tcp,
@@ -273,7 +272,6 @@ def view_in(
     ``rough``: distance (m) of the TCP, which is in the middle of the image, and tilt of the optical axis from the
     gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
-    camera, reference = files_of(camera=camera, reference=reference).values()
     given = None if reference is None else read_calibrated(reference)
     cam_T_grip = None if given is None else pose_of(given)[0]
     lens = None if camera is None else camera_in(camera).lens
@@ -334,7 +332,6 @@ def plane_inputs(
     """Read the files; a configuration supplies camera, gripper, jaw opening and rough calibration if they are not
     given. ``infer``: the gripper is unknown.  :class:`~gripmon.model.errors.InputError`.
     """
-    camera, config, gripper = files_of(camera=camera, config=config, gripper=gripper).values()
     files = [path for path in (camera, config, gripper, *corners) if path is not None]
     loaded = None if config is None else load_config(config, check_source=False, with_taught=False)
     if loaded is not None:

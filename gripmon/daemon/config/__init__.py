@@ -26,7 +26,6 @@ from gripmon.daemon.config.checks import (
     view_fault,
 )
 from gripmon.daemon.config.earlier import without_gone
-from gripmon.daemon.config.project import file_of
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
@@ -36,6 +35,7 @@ from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
+from gripmon.model.project import file_of
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import TaughtEdges, TaughtModel
 from gripmon.track.edges.taught import mismatch, own_covariance
@@ -156,7 +156,7 @@ def load_config(
     that are gone only those that had an effect are told, for files that can't be edited.  ``text``: what the file will
     hold, and ``taught`` its taught model, where these aren't written yet.
     """
-    path = file_of(Path(path), "config")
+    path = file_of(path, "config")
     values = read_configuration(path, text)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
