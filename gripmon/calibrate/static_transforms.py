@@ -25,7 +25,7 @@ FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 @dataclass(frozen=True, slots=True)
 class FramePair:
     """A transform between two frames, which is read when it is asked for: a file may hold others that can't be read.
-    ``camera``: which of them is the camera's, if the file says it.
+    ``camera``: which of them is the camera's, ``at_tcp``: whether the other one is at the TCP, if the file says it.
     """
 
     kind: str
@@ -34,6 +34,7 @@ class FramePair:
     parent_T_child: Callable[[], Array]
     camera: str | None = None
     covariance: tuple[float, ...] | None = None
+    at_tcp: bool | None = None
 
     @property
     def frames(self) -> tuple[str, str]:

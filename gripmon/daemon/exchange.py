@@ -89,7 +89,10 @@ def export_calibration(
         right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
         raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
     names = {**({"gripper_frame": source.frame} if source.frame else {}), **(frames or {})}
-    hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, name=name, **names)
+    hand_eye = HandEye(
+        source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, at_tcp=not source.frame, name=name,
+        **names,
+    )  # fmt: skip
     return Exported(write_hand_eye(hand_eye, kind, (*_notes(source, command), *source.pose_notes)).encode())
 
 

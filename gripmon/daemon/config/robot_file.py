@@ -97,7 +97,7 @@ def is_robot_reference(values: dict[str, Any]) -> bool:
 
 def reference_values(hand_eye: ForeignHandEye) -> dict[str, Any]:
     """Another program's hand/eye transform as such a file's values; no ``flange_T_tcp`` where it doesn't tell it."""
-    if hand_eye.covariance is not None:
+    if hand_eye.covariance is not None and hand_eye.at_tcp:
         return {"cam_T_grip": _listed(invert(hand_eye.grip_T_cam)), "covariance": list(hand_eye.covariance)}
     at_tcp = _listed(np.eye(4)) if hand_eye.at_tcp else None
     flange_T_cam = _listed(hand_eye.grip_T_cam)
