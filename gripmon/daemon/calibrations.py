@@ -15,21 +15,12 @@ import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration
-from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
 from gripmon.daemon.config.calibrated import foreign_camera, read_camera
-from gripmon.daemon.config.checks import covariance_of
-from gripmon.daemon.config.robot_file import (
-    at_flange,
-    frame_without_tcp,
-    is_robot_reference,
-    reference_values,
-    robot_reference,
-    sure,
-    tcp_unknown,
-)
+from gripmon.daemon.config.reference import covariance_of
+from gripmon.daemon.config.robot_file import RobotFile, tcp_unknown
 from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import GivenFile, kind_of, read_document, read_settings
 from gripmon.daemon.targets import target_of_command
@@ -78,14 +69,13 @@ def given_file(path: Path) -> GivenFile:
 
 
 def _foreign(file: GivenFile) -> Calibrated | None:
-    """What another program's file holds; None if it is of none that is known."""
+    """What a robot's file holds, or another program's; None if it is of none that is known."""
     if len(file.data) > _MOST_FOREIGN_BYTES:
         return None
-    path, hand_eye = file.path, read_hand_eye(file.document)
-    if hand_eye is None:
-        found = foreign_camera(file)
-        return None if found is None else Calibrated(str(path), "another program's camera", found.camera)
-    return _robot(path, reference_values(sure(path, hand_eye)))
+    if (robot := RobotFile.of(file)) is not None:
+        return _robot(robot)
+    found = foreign_camera(file)
+    return None if found is None else Calibrated(str(file.path), "another program's camera", found.camera)
 
 
 def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
@@ -95,8 +85,6 @@ def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
         return readers[str(values["schema"])](file)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
-    if is_robot_reference(values):
-        return _robot(path, values)
     if "fx_px" in values:
         return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
     kind = kind_of(values)
@@ -165,13 +153,12 @@ def _configuration(path: Path) -> Calibrated:
     )
 
 
-def _robot(path: Path, values: dict[str, object]) -> Calibrated:
-    frame = frame_without_tcp(values)
-    settings = at_flange(path, values) if frame else robot_reference(path, values)
+def _robot(file: RobotFile) -> Calibrated:
+    settings = file.of_flange() if file.frame else file.reference()
     told, covariance = settings.cam_T_grip, covariance_of(settings)
     return Calibrated(
-        str(path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
-        covariance=covariance, frame=frame, pose_notes=tuple(_uncertainty(covariance)),
+        str(file.path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
+        covariance=covariance, frame=file.frame, pose_notes=tuple(_uncertainty(covariance)),
     )  # fmt: skip
 
 

@@ -139,7 +139,7 @@ FILES["static transform, in YAML with names"] = FILES["static transform, in YAML
 ).replace("launch:\n", "launch:\n- node: {pkg: a, exec: b, name: static_transform_publisher_b, args: 1 2 3}\n")
 # What isn't run is no node, and a name may hold what ends a list, a tag or a comment.
 _NOT_RUN = '''def before() -> None:
-    """Node(executable="static_transform_publisher", arguments=["--frame-id", "tool0", "--child-frame-id", "old_cam"])"""
+    """Node(executable="static_transform_publisher", arguments=["--frame-id", "tool0", "--child-frame-id", "a_cam"])"""
 
 
 def generate'''

@@ -17,7 +17,8 @@ from gripmon.calibrate.bundle import GivenCamera
 from gripmon.daemon.calibrations import camera_in, given_file, pose_of, read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch
-from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
+from gripmon.daemon.config.checks import predict_view, view_fault
+from gripmon.daemon.config.reference import configured, covariance_of, reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import GivenFile, read_settings, read_yaml
