@@ -18,7 +18,7 @@ from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
-from gripmon.daemon.config.calibrated import foreign_camera, read_camera
+from gripmon.daemon.config.calibrated import foreign_camera, mismatch, read_camera
 from gripmon.daemon.config.reference import covariance_of
 from gripmon.daemon.config.robot_file import RobotFile, tcp_unknown
 from gripmon.daemon.config.typed import ConfigError
@@ -398,10 +398,8 @@ def _same_config(first: Calibrated, file: Path | None) -> Config:
     if first.cam_T_grip is None:
         raise InputError(f"{first.name}: is {first.kind}; with images, a hand/eye calibration")
     config = load_config(file, check_source=False)
-    if first.lens is not None and first.lens != config.settings.camera:
-        raise InputError(f"{first.name}: camera: isn't the one of {file}; the same camera calibration in both")
-    if first.gripper is not None and first.gripper.sha256 != gripper_digest(config.gripper):
-        raise InputError(f"{first.name}: gripper: {first.gripper.name} isn't the one of {file}; the same file in both")
+    if fault := mismatch(first.lens, first.gripper, config.settings.camera, config.gripper):
+        raise ConfigError.of(Path(first.name), fault)
     return config
 
 

@@ -215,7 +215,7 @@ def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
         try:
             backend_number(source)
         except SourceError as error:
-            return _split(f"source.{error}")
+            return Fault("", f"source.{error}", "")
     return None
 
 
@@ -255,7 +255,7 @@ def joined(settings: Settings, directory: Path) -> Joining | None:
     try:
         return joining(settings.publish, directory) if settings.publish.enabled else None
     except PublishError as error:
-        raise SettingsError(_split(str(error))) from None
+        raise SettingsError(Fault("", str(error), "")) from None
 
 
 def _ros2_missing(settings: Settings) -> Fault | None:
@@ -270,13 +270,5 @@ def _ros2_missing(settings: Settings) -> Fault | None:
             check_rclpy()
             domain_of(domain_id)
         except Ros2Missing as error:
-            wrong, _, right = str(error).partition("; ")
-            return Fault(key, wrong, right)
+            return Fault(key, str(error), "")
     return None
-
-
-def _split(text: str) -> Fault:
-    """The fault in a line ``key: what is wrong; what would be right``."""
-    key, _, rest = text.partition(": ")
-    wrong, _, right = rest.partition("; ")
-    return Fault(key, wrong, right)

@@ -24,7 +24,7 @@ _T = TypeVar("_T")
 
 
 class Fault(NamedTuple):
-    """What is wrong at a key, and what would be right."""
+    """What is wrong at a key, and what would be right; another room's line that says both stands in ``wrong`` alone."""
 
     key: str
     wrong: str
