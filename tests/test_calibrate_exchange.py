@@ -164,6 +164,24 @@ def test_the_hand_eye_of_every_source_is_the_same(made: Path, tmp_path: Path, ca
     assert yaml.full_load(easy)["parameters"]["name"] == "wrist"
 
 
+def test_a_projects_folder_stands_for_the_calibration_that_is_meant(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Its camera or its hand/eye calibration, by the format; beside --config, a folder is one of images."""
+    for kind, file in (("ros", "camera.yaml"), ("urdf", "hand_eye.yaml")):
+        of_file, of_folder = (gripmon(capsys, "export", each, "--format", kind) for each in (made / file, made))
+        assert of_file[0] == 0 and _undated(of_folder[1]) == _undated(of_file[1])
+    hand_eye_file(tmp_path / "hand_eye.yaml", np.array([0.0, 3e-4, 0.0, 0.0, 0.0, 0.0]))
+    by_file = gripmon(capsys, "verify", made / "hand_eye.yaml", tmp_path / "hand_eye.yaml", "--json")
+    assert gripmon(capsys, "verify", made, tmp_path, "--json") == by_file and by_file[0] == 3
+    code, _, said = gripmon(capsys, "verify", made, tmp_path, "--config", made)
+    assert code == 2 and f"{tmp_path}: no image in this folder" in said
+
+
+def _undated(text: str) -> str:
+    return "\n".join(line for line in text.splitlines() if "written " not in line)
+
+
 def test_the_last_valid_estimate_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     other = msgspec.structs.replace(MEASURED, cam_T_grip=to_record(TRUE), seq=1)
     path = tmp_path / "estimates.jsonl"

@@ -48,6 +48,21 @@ def test_lines_are_those_of_json(tmp_path: Path, capsys: pytest.CaptureFixture[s
             assert row.startswith(f"{level:<4}  {about}") and row.endswith(f"  {text}")
 
 
+def test_what_the_forecast_leaves_open_is_said_in_words(capsys: pytest.CaptureFixture[str]):
+    """Steps with their unit and axes, steps that are never noticed, and motions that end no view."""
+    assert main(["check", str(DEMO), "--json"]) == main(["check", str(DEMO), "--verbose"]) == 0
+    text, _, shown = capsys.readouterr().out.partition("\n}\n")
+    values = json.loads(f"{text}}}")
+    rows = [" ".join(line.split()) for line in shown.splitlines()]
+    assert "step mm x y z" in rows
+    for step_m, frames in values["accuracy"]["drift"]["delay_frames"].items():
+        assert f"{1e3 * float(step_m):g} {' '.join('never' if n is None else str(n) for n in frames)}" in rows
+    may = values["in_view"]["camera_may_move"]
+    assert may["shift_m"]["z"][0] is may["turn_rad"]["z"][1] is None
+    assert "shift -z more than 1000 mm -" in rows and "turn +z more than 180° -" in rows
+    assert f"shift +x {1e3 * may['shift_m']['x'][1]:.4g} mm {may['shift_reason']['x'][1]}" in rows
+
+
 @pytest.mark.parametrize(
     ("source", "said"),
     [

@@ -43,7 +43,7 @@ def table(path, setup, count=10, seed=1):
 def test_without_spots_it_says_what_would_be_noticed(laser, capsys):
     assert main(["check", "--laser", str(laser), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert [row["pulses"] for row in report["noticed"]] == [3, 10, 30, 100]
+    assert [row["spots"] for row in report["noticed"]] == [3, 10, 30, 100]
     for key in ("position_m", "rotation_rad"):
         sizes = np.array([row[key] for row in report["noticed"]])
         assert (np.diff(sizes, axis=0) < 0.0).all(), "more spots tell smaller motions"
@@ -55,7 +55,7 @@ def test_without_spots_it_says_what_would_be_noticed(laser, capsys):
     assert noisy["noticed"][0]["position_m"][0] > report["noticed"][0]["position_m"][0]
     assert main(["check", "--laser", str(laser)]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"^weakest +pulses 100, position .* mm, rotation .*°$", text, re.MULTILINE)
+    assert re.search(r"^weakest +spots 100, position .* mm, rotation .*°$", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

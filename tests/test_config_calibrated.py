@@ -15,11 +15,10 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.calibrate.interchange import write_camera
-from gripmon.daemon.calibrations import plane_inputs, read_calibrated
+from gripmon.daemon.calibrations import read_calibrated
 from gripmon.daemon.config import ConfigError, load_config, read_gripper
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.daemon.teaching import read_inputs
 from gripmon.judge.statefile import calibration_of
 from gripmon.model.camera import BrownConradyLens
 from gripmon.model.errors import InputError
@@ -87,18 +86,9 @@ def test_files_and_sections_say_the_same(folder: Path):
     assert by_files.reference.covariance == COVARIANCE and not by_files.reference.with_gripper
 
 
-def test_a_projects_folder_is_what_its_files_are(folder: Path):
-    """By their usual names: its configuration, its camera, its gripper and its hand/eye calibration."""
-    named = {"camera": CAM, "gripper": "gripper.yaml", "reference": HE}
-    of_folder = read_inputs([], command="a", live="0", **dict.fromkeys(named, folder))
-    of_files = read_inputs([], command="a", live="0", **{part: folder / name for part, name in named.items()})
-    assert of_folder.setup.reference == of_files.setup.reference
-    assert of_folder.calibrations == of_files.calibrations == {"camera": folder / CAM, "reference": folder / HE}
-    assert of_folder.gripper_path == folder / "gripper.yaml"
+def test_a_projects_folder_is_its_configuration(folder: Path):
     (folder / ARM).rename(folder / "config.yaml")
     assert load_config(folder).path == folder / "config.yaml"
-    inputs = plane_inputs(folder, folder, folder, (), None, infer=False)
-    assert set(inputs.files) == {folder / name for name in (CAM, "gripper.yaml", HE, "config.yaml")}
 
 
 def test_the_response_that_a_references_images_show_holds_where_nothing_else_is_said(folder: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,10 +28,12 @@ from support.hand_eye_texts import (
 
 from gripmon.calibrate.foreign import InterchangeError
 from gripmon.calibrate.hand_eye_files import HAND_EYE_FORMATS, HandEye, write_hand_eye
+from gripmon.calibrate.hand_eye_formats import TCP_FRAME
 from gripmon.cli import main
 from gripmon.daemon.calibrations import pose_in, read_calibrated
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, invert, to_record
+from gripmon.model.yaml_text import as_yaml
 
 AT_TOOL0 = "flange_T_tcp: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 0, 1]}"
 
@@ -62,11 +65,11 @@ def test_what_is_exported_is_imported_as_it_was(kind: str, turned: bool, tmp_pat
     covariance = tuple((np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) ** 2).ravel().tolist())
     hand_eye = HandEye(to_record(invert(GRIP_T_CAM)), covariance, gripper_in_camera=turned)
     path, out = tmp_path / "written", tmp_path / "reference.yaml"
-    path.write_text(write_hand_eye(hand_eye, kind, ["gripmon calibrate export 'a--b.yaml' --format x"]))
+    path.write_text(write_hand_eye(hand_eye, kind, ["written 2026 by gripmon 1: gripmon calibrate export 'a--b.yaml'"]))
     assert main(["calibrate", "import", str(path), "--out", str(out)]) == 0
     for file in (path, out):
         back = read_calibrated(file)
-        assert back.cam_T_grip is not None
+        assert back.cam_T_grip is not None and not back.frame, "at the TCP"
         np.testing.assert_allclose(from_record(back.cam_T_grip) @ GRIP_T_CAM, np.eye(4), rtol=0.0, atol=1e-12)
         if kind == "json":  # the only one that holds it
             assert back.covariance == covariance
@@ -175,6 +178,29 @@ def test_a_file_that_is_written_of_another_one_keeps_its_frame(tmp_path: Path):
     again = read_hand_eye(out.read_bytes(), "x")
     assert again is not None and again.gripper_frame == "tool0" and not again.at_tcp
     np.testing.assert_allclose(again.grip_T_cam, GRIP_T_CAM, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", HAND_EYE_FORMATS)
+def test_only_a_file_of_ours_says_that_a_frame_is_at_the_tcp(kind: str, tmp_path: Path, capsys):
+    """By its name in a file that we wrote; a robot's own frame of that name may be anywhere."""
+    ours, theirs, again = (tmp_path / name for name in ("ours.yaml", "theirs.yaml", "again.x"))
+    ours.write_text(as_yaml({"cam_T_grip": msgspec.to_builtins(to_record(invert(GRIP_T_CAM)))}))
+    theirs.write_text(EASY_2.replace("tool0", TCP_FRAME))
+    export = ["calibrate", "export", str(ours), "--format", kind, "--out", str(again)]
+    assert main(export) == 0
+    found = read_hand_eye(again.read_bytes(), "x")
+    assert found is not None and found.gripper_frame == TCP_FRAME and found.at_tcp
+    found = read_hand_eye(theirs.read_bytes(), "x")
+    assert found is not None and found.gripper_frame == TCP_FRAME and not found.at_tcp
+    export[2] = str(theirs)
+    again.unlink()
+    assert main(export) == 2 and not again.exists()
+    assert "gripper_tcp isn't at the TCP, as it is in gripmon's files; another name" in capsys.readouterr().err
+    assert main([*export, "--gripper-frame", "tool0"]) == 0
+    found = read_hand_eye(again.read_bytes(), "x")
+    assert found is not None and found.gripper_frame == "tool0" and not found.at_tcp
+    with pytest.raises(InputError, match="flange_T_tcp: isn't said"):
+        pose_in(again)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from gripmon.laser.ways import PAIRS, disagreements, three_ways
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Cause
 
-STRICT = CheckSettings(false_alarms_per_1000_pulses=10.0)
+STRICT = CheckSettings(false_alarms_per_1000_spots=10.0)
 ARM = (1e-4, 2e-4)
 
 
@@ -340,7 +340,7 @@ def test_motions_show_about_as_small_as_foreseen(index, axis):
     for factor in seen:
         for seed in range(4):
             rng = np.random.default_rng([seed, 19])
-            where = some(rng, foreseen.pulses)
+            where = some(rng, foreseen.spots)
             uv_px = fresh(drawn_setup(rng).moved(factor * change), where, rng)
             seen[factor] += checked(uv_px, where).verdict == "moved"
     assert seen == {2.0: 4, 0.1: 0}

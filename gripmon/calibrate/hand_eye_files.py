@@ -31,8 +31,8 @@ _FRAME = re.compile(r"[^/\s\"'<>&][^\s\"'<>&]*")
 class HandEye:
     """The data to export: ``cam_T_grip`` with its 6 x 6 covariance (as published), and the frames' names.
 
-    ``name`` is the calibration's; the marker's frame and the robot's base appear in an easy_handeye2 file only for
-    completeness.
+    ``at_tcp``: whether the gripper's frame is at the TCP; ``name`` is the calibration's; the marker's frame and the
+    robot's base appear in an easy_handeye2 file only for completeness.
     """
 
     cam_T_grip: Transform
@@ -40,6 +40,7 @@ class HandEye:
     gripper_frame: str = TCP_FRAME
     camera_frame: str = "camera_optical_frame"
     gripper_in_camera: bool = False
+    at_tcp: bool = True
     name: str = "gripmon"
     robot_base_frame: str = "base_link"
     tracking_marker_frame: str = "calibration_plate"
@@ -51,6 +52,8 @@ class HandEye:
                 raise ValueError(
                     f"{key}: {value!r} isn't a frame's name; without blanks, quotes, angle brackets, and no / in front"
                 )
+        if self.gripper_frame == TCP_FRAME and not self.at_tcp:
+            raise ValueError(f"gripper_frame: {TCP_FRAME} isn't at the TCP, as it is in gripmon's files; another name")
         if self.gripper_frame == self.camera_frame:
             raise ValueError(f"both frames are called {self.camera_frame}; two names")
 
@@ -137,6 +140,7 @@ def _json(hand_eye: HandEye, notes: Sequence[str]) -> str:
         },
         "cam_T_grip": msgspec.to_builtins(hand_eye.cam_T_grip),
         "covariance": list(hand_eye.covariance),
+        "at_tcp": hand_eye.at_tcp,
         "notes": list(notes),
     }
     return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

@@ -28,9 +28,10 @@ _READ = "a hand/eye transform of easy_handeye, MoveIt, static_transform_publishe
 FARTHEST_M = 5.0
 """Distance of a gripper from its wrist camera beyond which another unit was meant."""
 TCP_FRAME = "gripper_tcp"
-"""The frame that is called so, as :mod:`gripmon.calibrate.hand_eye_files` calls it, is at the TCP; where the TCP is in
-any other frame, a file of these formats doesn't say.
+"""The frame that is called so is at the TCP in what :mod:`gripmon.calibrate.hand_eye_files` has written; a robot's own
+of that name may be anywhere, and where the TCP is in another frame, a file of these formats doesn't say.
 """
+_WRITTEN_HERE = re.compile(r"\bwritten \S+ by gripmon \S+:")
 BODY_AXES = "the axes of a ROS body such as camera_link (x forward, y left, z up) instead of a camera's (z forward)"
 _CAMERA = re.compile(r"cam(?:era)?(?:\d|_|$|/)|optical|rgb|colou?r|depth|infra|realsense|zed|oak|d4\d\d|eye", re.I)
 _BASE = re.compile(
@@ -44,7 +45,8 @@ _BASE = re.compile(
 @dataclass(frozen=True, slots=True)
 class ForeignHandEye:
     """The camera's pose in the gripper's frame, ``grip_T_cam`` (4, 4), as a file of the format ``kind`` has it, and the
-    covariance (6·6) of ``cam_T_grip`` if it has that.  ``doubt``: why it may be in other axes than a camera's.
+    covariance (6·6) of ``cam_T_grip`` if it has that.  ``at_tcp``: whether the file itself says that the gripper's
+    frame is at the TCP; ``doubt``: why the camera's may have other axes than a camera's.
     """
 
     kind: str
@@ -52,12 +54,8 @@ class ForeignHandEye:
     camera_frame: str
     grip_T_cam: Array
     covariance: tuple[float, ...] | None = None
+    at_tcp: bool = False
     doubt: str = ""
-
-    @property
-    def at_tcp(self) -> bool:
-        """Whether the file itself says that the gripper's frame is at the TCP."""
-        return self.covariance is not None or self.gripper_frame == TCP_FRAME
 
 
 def read_hand_eye(document: Document, *, which: str | None = None) -> ForeignHandEye | None:
@@ -87,7 +85,8 @@ def read_hand_eye(document: Document, *, which: str | None = None) -> ForeignHan
     if body is None:
         doubt = f"{camera} may have {BODY_AXES}; if so, the pose of its optical frame"
         hand_eye = replace(hand_eye, doubt=doubt)
-    return hand_eye
+    named = hand_eye.gripper_frame == TCP_FRAME and _WRITTEN_HERE.search(document.text) is not None
+    return replace(hand_eye, at_tcp=named if pair.at_tcp is None else pair.at_tcp)
 
 
 def _likely(found: Sequence[FramePair]) -> list[FramePair]:
@@ -236,7 +235,10 @@ def _own_json(values: FileValues) -> FramePair:
     # With --gripper-in-camera, the camera's frame is the parent.
     camera, gripper = (parent, child) if np.allclose(np.reshape(matrix, (4, 4)), pose, atol=1e-9) else (child, parent)
     covariance = values.numbers("covariance", (36,), "6 x 6 numbers")
-    return FramePair("json", camera, gripper, lambda: pose, camera, covariance)
+    at_tcp = values.content.get("at_tcp", True)
+    if not isinstance(at_tcp, bool):
+        raise values.fault("at_tcp", f"is {at_tcp!r}", "true or false")
+    return FramePair("json", camera, gripper, lambda: pose, camera, covariance, at_tcp)
 
 
 def _joints(document: Document) -> Iterator[FramePair]:

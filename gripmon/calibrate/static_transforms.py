@@ -4,13 +4,17 @@ file (Python, XML, YAML), such as MoveIt's.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import re
 import shlex
+import textwrap
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -25,7 +29,7 @@ FIXED = "is a fixed camera's pose; gripmon calibrate robot-world is for those"
 @dataclass(frozen=True, slots=True)
 class FramePair:
     """A transform between two frames, which is read when it is asked for: a file may hold others that can't be read.
-    ``camera``: which of them is the camera's, if the file says it.
+    ``camera``: which of them is the camera's, ``at_tcp``: whether the other one is at the TCP, if the file says it.
     """
 
     kind: str
@@ -34,23 +38,18 @@ class FramePair:
     parent_T_child: Callable[[], Array]
     camera: str | None = None
     covariance: tuple[float, ...] | None = None
+    at_tcp: bool | None = None
 
     @property
     def frames(self) -> tuple[str, str]:
         return self.parent, self.child
 
 
-_COMMENT = re.compile(r"<!--.*?-->|^[ \t]*#.*?$", re.DOTALL | re.MULTILINE)
-_NODE = re.compile(r"<node\b[^>]*>")
-_CALL = re.compile(r"\bNode\(")
-_MARK = re.compile(r""""(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|#[^\n]*|[()]""")
-_EXECUTABLE = re.compile(r"""\b(?:(?:node_)?exec(?:utable)?|type)\s*=\s*["']static_transform_publisher["']""")
-_ARGUMENTS = re.compile(r"arguments\s*=\s*\[(.*?)\]", re.DOTALL)
-_ARGS = re.compile(r"""\bargs\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_PUBLISHER = "static_transform_publisher"
+_COMMENT = re.compile(r"^[ \t]*#.*?$", re.MULTILINE)
 _LINE = re.compile(r"(?:^|[\s/])static_transform_publisher[ \t]+([^\n]*)", re.MULTILINE)
 _SHELL = re.compile(r"\s#|\s\d>|[;&|<>]")
 """Ends a command: a comment, another command, where its output goes."""
-_WORD = re.compile(r"""["']([^"']*)["']|([-+.\w]+)""")
 
 
 def published_transforms(document: Document) -> Iterator[FramePair]:
@@ -68,40 +67,54 @@ def published_transforms(document: Document) -> Iterator[FramePair]:
 
 def _commands(document: Document) -> Iterator[str | list[str]]:
     """The arguments of each node with this executable, whatever its name; or of each line of a shell."""
-    text = _COMMENT.sub("", document.text).replace("\\\n", " ")
+    text = document.text
     if text.lstrip().startswith("<"):
-        for node in filter(_EXECUTABLE.search, _NODE.findall(text)):
-            args = _ARGS.search(node)
-            yield "" if args is None else args[1] or args[2] or ""
-    elif _CALL.search(text):
-        for node in filter(_EXECUTABLE.search, _calls(text)):
-            listed = _ARGUMENTS.search(node)
-            inside = "" if listed is None else re.sub(r"#[^\n]*", "", listed[1])
-            yield [quoted or bare for quoted, bare in _WORD.findall(inside)]
-    else:
-        nodes: list[str] = []
-        with contextlib.suppress(InterchangeError, RecursionError):  # no YAML
-            nodes = _yaml_nodes(document.content)
-        yield from nodes or [_SHELL.split(line, maxsplit=1)[0] for line in _LINE.findall(text)]
+        yield from _xml_nodes(text)
+        return
+    nodes: Sequence[str | list[str]] = _python_nodes(text) if "Node(" in text else []
+    with contextlib.suppress(InterchangeError, RecursionError):  # no YAML
+        nodes = nodes or _yaml_nodes(document.content)
+    lines = _LINE.findall(_COMMENT.sub("", text).replace("\\\n", " ")) if "Node(" not in text else []
+    yield from nodes or [_SHELL.split(line, maxsplit=1)[0] for line in lines]
 
 
-def _calls(text: str) -> Iterator[str]:
-    """Each ``Node(…)`` of a Python file, to its closing bracket."""
-    begin = _CALL.search(text)
-    while begin is not None:
-        depth, end = 0, len(text)
-        for mark in _MARK.finditer(text, begin.start()):
-            depth += {"(": 1, ")": -1}.get(mark[0], 0)
-            if depth == 0 and mark[0] == ")":
-                end = mark.end()
-                break
-        yield text[begin.start() : end]
-        begin = _CALL.search(text, end)
+def _xml_nodes(text: str) -> list[str]:
+    try:
+        nodes = ElementTree.fromstring(text).iter("node")
+    except ElementTree.ParseError:
+        return []
+    return [n.get("args", "") for n in nodes if _PUBLISHER in (n.get("exec"), n.get("executable"), n.get("type"))]
+
+
+def _python_nodes(text: str) -> list[list[str]]:
+    """Of a launch file in Python, which is parsed, not run: what isn't written out in it is no number."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of its own escapes
+            tree = ast.parse(textwrap.dedent(text))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return []
+    found = []
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        named = {each.arg: each.value for each in call.keywords}
+        executable = named.get("executable") or named.get("node_executable")
+        if ast.unparse(call.func).endswith("Node") and _literal(executable) == _PUBLISHER:
+            listed = named.get("arguments")
+            found.append([_literal(each) for each in listed.elts] if isinstance(listed, ast.List | ast.Tuple) else [])
+    return found
+
+
+def _literal(node: ast.expr | None) -> str:
+    """A text or a number as text; anything else as it is written."""
+    try:
+        return "" if node is None else str(ast.literal_eval(node))
+    except ValueError:
+        return ast.unparse(node) if node is not None else ""
 
 
 def _yaml_nodes(content: Any) -> list[str]:
     parts = list(content.values()) if isinstance(content, Mapping) else content if isinstance(content, list) else []
-    if isinstance(content, Mapping) and content.get("exec") == "static_transform_publisher":
+    if isinstance(content, Mapping) and content.get("exec") == _PUBLISHER:
         return [str(content.get("args", ""))]
     return [args for part in parts for args in _yaml_nodes(part)]
 

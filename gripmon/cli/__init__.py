@@ -205,7 +205,18 @@ def _complete_files(parser: argparse.ArgumentParser, files: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line (default: the process's own); return its exit code; wrong usage raises ``SystemExit(2)``."""
-    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        try:
+            return _run(sys.argv[1:] if arguments is None else arguments)
+        finally:  # also of what argparse prints
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output has closed it.  Without this Python would report it again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _EXIT_BROKEN_PIPE
+
+
+def _run(words: list[str]) -> int:
     named = [word for word in words if not word.startswith("-")]  # before a command no option has a value
     parser = build_parser(named[:2])
     chosen: Any = parser.parse_args(words, _arguments() if named else None)
@@ -216,19 +227,13 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault(variable, value)
     command: Command = chosen.command
     try:
-        code = command.run(chosen)
-        sys.stdout.flush()
+        return command.run(chosen)
     except (InputError, NoResultError) as error:
         print(_in_words(error, chosen), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # The reader of our output has closed it.  Without this Python would report it again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _EXIT_BROKEN_PIPE
-    return code
 
 
 def _arguments() -> Arguments:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number
 from gripmon.model.errors import InputError, input_errors
+from gripmon.model.project import file_of
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 DEFAULT_LEVEL = 0.01
 
 _VERIFY_OPTIONS = """
-A                    calibration
+A                    calibration: a file, or a project's folder for its hand_eye.yaml
 B...                 the other calibration, or images (files, folders)
 --config CONFIG      with images: the configuration with gripper and monitor
 --target TARGET      with images: the plate that the gripper stands on
@@ -74,7 +75,7 @@ def verify(arguments: Arguments) -> int:
     tolerance_m, tolerance_rad = arguments.metres("tolerance_mm"), arguments.radians("tolerance_deg")
     if (tolerance_m is None) is not (tolerance_rad is None):
         raise InputError("--tolerance-mm and --tolerance-deg: one without the other; both or none")
-    first = read_calibrated(Path(arguments.a))
+    first = read_calibrated(file_of(arguments.a, "reference"))
     second, doubts = _second(first, arguments)
     found = verify(
         first, second, level=arguments.level, tolerance_m=tolerance_m, tolerance_rad=tolerance_rad,
@@ -96,17 +97,23 @@ def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[
     from gripmon.model.images import IMAGE_SUFFIXES
 
     names: list[str] = arguments.b
-    if any(Path(n).is_dir() or Path(n).suffix.lower() in IMAGE_SUFFIXES for n in names):
+
+    def of_images(name: str) -> bool:
+        if not Path(name).is_dir():
+            return Path(name).suffix.lower() in IMAGE_SUFFIXES
+        # Images need the configuration: without it, a folder with a calibration is a project's.
+        return arguments.config is not None or not file_of(name, "reference").is_file()
+
+    if any(map(of_images, names)):
         target = None if arguments.target is None else target_of(arguments.target)
         return measure_again(
             first, names, arguments.config, target, other_target=arguments.other_target,
             jaw_opening_m=arguments.jaw_opening,
         )  # fmt: skip
-    of_images = "config", "target", "other_target", "jaw_opening"
-    arguments.refuse(of_images, "applies only to images; leave it out")
+    arguments.refuse(("config", "target", "other_target", "jaw_opening"), "applies only to images; leave it out")
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
-    return read_calibrated(Path(names[0])), ()
+    return read_calibrated(file_of(names[0], "reference")), ()
 
 
 CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
@@ -133,7 +140,7 @@ _IMPORT_EXAMPLES = """\
 exit codes: 0 written; 2 wrong usage or files: nothing is written then"""
 
 _EXPORT_OPTIONS = """
-CALIBRATION  file with the calibration
+CALIBRATION  file with the calibration, or a project's folder that holds it
 --format     what to write
 --out FILE   file to write (default: to the terminal)
 --force      replace the file if there is one
@@ -219,7 +226,8 @@ def export(arguments: Arguments) -> None:
     frames = {key: name for key in _FRAMES if (name := getattr(arguments, key))}
     with input_errors("calibrate export"):
         exported = export_calibration(
-            arguments.calibration, arguments.format, arguments.command_line(), name=arguments.name or "gripmon",
+            file_of(arguments.calibration, "camera" if camera else "reference"), arguments.format,
+            arguments.command_line(), name=arguments.name or "gripmon",
             suffix="" if arguments.out is None else arguments.out.suffix, fit=arguments.fit, frames=frames,
             gripper_in_camera=arguments.gripper_in_camera,
         )  # fmt: skip

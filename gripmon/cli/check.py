@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +117,7 @@ def _check(arguments: Arguments) -> int:
 
 def _lines(values: dict[str, Any], *, verbose: bool) -> list[str]:
     """A headline, then a line a finding; with ``verbose`` all other values."""
-    findings, rest = values["findings"], {key: value for key, value in values.items() if key != "findings"}
+    findings, rest = values["findings"], _in_tables(values)
     parts = []
     for level, what, none in (("FAIL", "failure", "sound"), ("WARN", "warning", "")):
         count = sum(each["level"] == level for each in findings)
@@ -124,6 +125,30 @@ def _lines(values: dict[str, Any], *, verbose: bool) -> list[str]:
     head = f"{values['config']}: {', '.join(filter(None, parts))}"
     rows = render.columns([[*each.values()] for each in findings])
     return [head, *rows, *(["", *render.lines(rest)] if verbose else [])]
+
+
+def _in_tables(values: dict[str, Any]) -> dict[str, Any]:
+    """All but the findings, with a table where a mapping's keys are values, or None means more than nothing."""
+    accuracy, in_view = values["accuracy"], values["in_view"]
+    if (drift := accuracy["drift"]) is not None:
+        rows = [
+            {"step_m": float(step_m), **dict(zip("xyz", ("never" if n is None else n for n in frames), strict=True))}
+            for step_m, frames in drift["delay_frames"].items()
+        ]
+        accuracy = {**accuracy, "drift": {**drift, "delay_frames": rows}}
+    if (freedom := in_view["camera_may_move"]) is not None:
+        in_view = {**in_view, "camera_may_move": [*_freedom(freedom, "shift", "m"), *_freedom(freedom, "turn", "rad")]}
+    rest = {key: value for key, value in values.items() if key != "findings"}
+    return {**rest, "accuracy": accuracy, "in_view": in_view}
+
+
+def _freedom(freedom: dict[str, Any], motion: str, unit: str) -> Iterator[dict[str, Any]]:
+    """A row for each axis and direction of a motion."""
+    sought = render.amount(f"sought_{unit}", freedom[f"sought_{unit}"])
+    for axis, amounts in freedom[f"{motion}_{unit}"].items():
+        for sign, amount, reason in zip("-+", amounts, freedom[f"{motion}_reason"][axis], strict=True):
+            by = f"more than {sought}" if amount is None else render.amount(f"by_{unit}", amount)
+            yield {"motion": f"{motion} {sign}{axis}", "by": by, "then": reason}
 
 
 def _check_laser(arguments: Arguments) -> int:
@@ -144,7 +169,7 @@ def _check_laser(arguments: Arguments) -> int:
         "rms_px": residuals.rms_px,
         "arm_noise_m": settings.arm_noise_m,
         "arm_noise_rad": settings.arm_noise_rad,
-        "false_alarms_per_1000_pulses": settings.false_alarms_per_1000_pulses,
+        "false_alarms_per_1000_spots": settings.false_alarms_per_1000_spots,
     }
     if not arguments.config:
         report = {**header, **msgspec.to_builtins(forecast_laser(calibration, settings))}
@@ -192,5 +217,5 @@ def _check_settings(arguments: Arguments) -> CheckSettings:
         if value is not None and value > most:
             raise InputError(f"--{name.replace('_', '-')} {value:g}: too many; at most {most:g}")
         if value is not None:
-            given["false_alarms_per_1000_pulses" if name == "false_alarms" else name] = value
+            given["false_alarms_per_1000_spots" if name == "false_alarms" else name] = value
     return CheckSettings(**given)

@@ -14,10 +14,12 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from gripmon.model.errors import InputError
+from gripmon.model.project import Part, file_of
 from gripmon.model.units import jaw_opening_in, jaw_range_in
 
 _T = TypeVar("_T")
@@ -39,6 +41,10 @@ VIEW_OPTION = """
         auto (native if there is a display), or server (only the stream that viewers connect to)
 """
 _PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
+_PARTS: dict[str, Part] = {
+    "camera": "camera", "lens": "camera", "gripper": "gripper", "reference": "reference", "config": "config",
+}  # fmt: skip
+"""Options that name a file of a project, for which its folder stands."""
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
@@ -55,8 +61,8 @@ class Command:
     which continues in indented lines: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most one,
     one or more, any number; ``--flag``, ``--option VALUE``, ``--option VALUE...`` for one that may be repeated.  A row
     that begins with ``|`` excludes the previous row.  ``groups``: further tables by title, each with a description.
-    Values called FILE, DIR and the like are paths.  ``more``: keywords of ``add_argument`` for single arguments, or
-    only a type.
+    Values called FILE, DIR and the like are paths, those of :data:`_PARTS` also a project's folder.  ``more``:
+    keywords of ``add_argument`` for single arguments, or only a type.
     """
 
     def __init__(
@@ -108,7 +114,8 @@ class Command:
         if metavar:
             keywords["metavar"] = metavar
         if _PATHS.match(metavar):
-            keywords["type"] = Path
+            part = _PARTS.get(name)
+            keywords["type"] = Path if part is None else partial(file_of, part=part)
         if not option:
             keywords["nargs"] = _NUMBERS[re.sub(r"[^][.]", "", word.replace(metavar, ""))]
         elif value.endswith("..."):

@@ -55,6 +55,12 @@ def named(key: str) -> str:
     return " ".join(_WORDS.get(word, word) for word in words)
 
 
+def amount(key: str, value: float) -> str:
+    """A single value of a key with its unit."""
+    factor, unit = _unit(key)
+    return _cell(value, factor) + unit
+
+
 def _names(keys: Iterable[str]) -> dict[str, str]:
     """Keys in words; of those whose words are the same, a length is the position's and an angle the rotation's."""
     words = {key: named(key) for key in keys}

@@ -65,13 +65,13 @@ def run(arguments: Arguments) -> int:
 
     """
     with signals_exit() as stop:
-        from gripmon.daemon.starting import run_file
+        from gripmon.daemon.starting import RunOptions, run_file
 
-        return run_file(
-            arguments.config, out=arguments.out, duration_s=arguments.duration, verbose=arguments.verbose,
-            log_json=arguments.log_json, fresh_state=arguments.fresh_state, view=arguments.view,
-            take_over=arguments.take_over, stop=stop,
+        options = RunOptions(
+            out=arguments.out, stop=stop, duration_s=arguments.duration, fresh_state=arguments.fresh_state,
+            view=arguments.view, take_over=arguments.take_over,
         )  # fmt: skip
+        return run_file(arguments.config, options, verbose=arguments.verbose, log_json=arguments.log_json)
 
 
 _NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state", "snapshot")

@@ -15,22 +15,12 @@ import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration
-from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
-from gripmon.daemon.config.calibrated import foreign_camera, read_camera
-from gripmon.daemon.config.checks import covariance_of
-from gripmon.daemon.config.project import files_of
-from gripmon.daemon.config.robot_file import (
-    at_flange,
-    frame_without_tcp,
-    is_robot_reference,
-    reference_values,
-    robot_reference,
-    sure,
-    tcp_unknown,
-)
+from gripmon.daemon.config.calibrated import foreign_camera, mismatch, read_camera
+from gripmon.daemon.config.reference import covariance_of
+from gripmon.daemon.config.robot_file import RobotFile, tcp_unknown
 from gripmon.daemon.config.typed import ConfigError
 from gripmon.daemon.config.yaml_file import GivenFile, kind_of, read_document, read_settings
 from gripmon.daemon.targets import target_of_command
@@ -79,14 +69,13 @@ def given_file(path: Path) -> GivenFile:
 
 
 def _foreign(file: GivenFile) -> Calibrated | None:
-    """What another program's file holds; None if it is of none that is known."""
+    """What a robot's file holds, or another program's; None if it is of none that is known."""
     if len(file.data) > _MOST_FOREIGN_BYTES:
         return None
-    path, hand_eye = file.path, read_hand_eye(file.document)
-    if hand_eye is None:
-        found = foreign_camera(file)
-        return None if found is None else Calibrated(str(path), "another program's camera", found.camera)
-    return _robot(path, reference_values(sure(path, hand_eye)))
+    if (robot := RobotFile.of(file)) is not None:
+        return _robot(robot)
+    found = foreign_camera(file)
+    return None if found is None else Calibrated(str(file.path), "another program's camera", found.camera)
 
 
 def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
@@ -96,8 +85,6 @@ def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
         return readers[str(values["schema"])](file)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
-    if is_robot_reference(values):
-        return _robot(path, values)
     if "fx_px" in values:
         return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
     kind = kind_of(values)
@@ -166,13 +153,12 @@ def _configuration(path: Path) -> Calibrated:
     )
 
 
-def _robot(path: Path, values: dict[str, object]) -> Calibrated:
-    frame = frame_without_tcp(values)
-    settings = at_flange(path, values) if frame else robot_reference(path, values)
+def _robot(file: RobotFile) -> Calibrated:
+    settings = file.of_flange() if file.frame else file.reference()
     told, covariance = settings.cam_T_grip, covariance_of(settings)
     return Calibrated(
-        str(path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
-        covariance=covariance, frame=frame, pose_notes=tuple(_uncertainty(covariance)),
+        str(file.path), "a robot's hand/eye calibration", cam_T_grip=Transform(told.translation_m, told.rotation_xyzw),
+        covariance=covariance, frame=file.frame, pose_notes=tuple(_uncertainty(covariance)),
     )  # fmt: skip
 
 
@@ -273,7 +259,6 @@ def view_in(
     ``rough``: distance (m) of the TCP, which is in the middle of the image, and tilt of the optical axis from the
     gripper's z axis (degrees).  :class:`~gripmon.model.errors.InputError` for files without a camera or a pose.
     """
-    camera, reference = files_of(camera=camera, reference=reference).values()
     given = None if reference is None else read_calibrated(reference)
     cam_T_grip = None if given is None else pose_of(given)[0]
     lens = None if camera is None else camera_in(camera).lens
@@ -334,7 +319,6 @@ def plane_inputs(
     """Read the files; a configuration supplies camera, gripper, jaw opening and rough calibration if they are not
     given. ``infer``: the gripper is unknown.  :class:`~gripmon.model.errors.InputError`.
     """
-    camera, config, gripper = files_of(camera=camera, config=config, gripper=gripper).values()
     files = [path for path in (camera, config, gripper, *corners) if path is not None]
     loaded = None if config is None else load_config(config, check_source=False, with_taught=False)
     if loaded is not None:
@@ -414,10 +398,8 @@ def _same_config(first: Calibrated, file: Path | None) -> Config:
     if first.cam_T_grip is None:
         raise InputError(f"{first.name}: is {first.kind}; with images, a hand/eye calibration")
     config = load_config(file, check_source=False)
-    if first.lens is not None and first.lens != config.settings.camera:
-        raise InputError(f"{first.name}: camera: isn't the one of {file}; the same camera calibration in both")
-    if first.gripper is not None and first.gripper.sha256 != gripper_digest(config.gripper):
-        raise InputError(f"{first.name}: gripper: {first.gripper.name} isn't the one of {file}; the same file in both")
+    if fault := mismatch(first.lens, first.gripper, config.settings.camera, config.gripper):
+        raise ConfigError.of(Path(first.name), fault)
     return config
 
 

@@ -13,7 +13,7 @@ from gripmon.calibrate.hand_eye_formats import read_hand_eye
 from gripmon.calibrate.interchange import FORMATS, Exported, write_camera
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.calibrations import given_file, read_calibrated
-from gripmon.daemon.config.robot_file import TCP, reference_values, robot_reference
+from gripmon.daemon.config.robot_file import TCP, RobotFile
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
@@ -38,20 +38,20 @@ def import_calibration(
     if hand_eye is not None:
         if size_px is not None or model is not None:
             raise InputError(f"{path}: is a hand/eye transform ({hand_eye.kind}); without --size and --model")
-        values = reference_values(hand_eye)
+        robot = RobotFile.foreign(path, hand_eye)
         origin = f"{hand_eye.kind}: {hand_eye.gripper_frame} to {hand_eye.camera_frame}"
         notes = [f"{origin}, from {path.name}, SHA-256 {made.inputs[0].sha256}", f"written {made.time}: {made.command}"]
         x, y, z = (1e3 * invert(hand_eye.grip_T_cam)[:3, 3]).tolist()
         lines = [origin, f"{hand_eye.gripper_frame} is at {x:.1f}, {y:.1f}, {z:.1f} mm in the camera frame"]
         if hand_eye.at_tcp:
-            robot_reference(path, values)  # whole: nothing is to be completed
+            robot.reference()  # whole: nothing is to be completed
         else:
             tcp = f"flange_T_tcp is to be filled in: where {TCP} is in {hand_eye.gripper_frame}"
             example = "translation_m: [0.0, 0.0, 0.2], rotation_xyzw: [0.0, 0.0, 0.0, 1.0]"
             notes, lines = [*notes, f"{tcp}, for example {{{example}}}"], [*lines, tcp]
         if hand_eye.doubt:
             notes, lines = [*notes, hand_eye.doubt], [*lines, f"warning: {hand_eye.doubt}"]
-        text = "".join(f"# {note}\n" for note in notes) + as_yaml(values, inline=True)
+        text = "".join(f"# {note}\n" for note in notes) + as_yaml(robot.values, inline=True)
         return text.encode(), lines
     found = read_foreign_camera(file.document, which=which, size_px=size_px, model=model)
     camera, lens = found.camera, found.camera.__struct_config__.tag
@@ -89,7 +89,10 @@ def export_calibration(
         right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"
         raise InputError(f"{source.name}: is {source.kind}, which has no hand/eye transform; {right}")
     names = {**({"gripper_frame": source.frame} if source.frame else {}), **(frames or {})}
-    hand_eye = HandEye(source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, name=name, **names)
+    hand_eye = HandEye(
+        source.cam_T_grip, source.covariance, gripper_in_camera=gripper_in_camera, at_tcp=not source.frame, name=name,
+        **names,
+    )  # fmt: skip
     return Exported(write_hand_eye(hand_eye, kind, (*_notes(source, command), *source.pose_notes)).encode())
 
 

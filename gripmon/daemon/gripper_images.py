@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from gripmon.daemon.calibrations import camera_in, pose_in
-from gripmon.daemon.config.project import file_of
 from gripmon.io.sources.files import TIMESTAMPS_NAME, VideoSettings, VideoSource, opening_beside
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
@@ -110,7 +109,6 @@ def images_inputs(images: Sequence[Path | NamedImage], camera: Path, reference: 
     """Read the files; openings come from a ``timestamps.csv`` beside each image file, if there is one.
     :class:`~gripmon.model.errors.InputError`.
     """
-    camera, reference = file_of(camera, "camera"), None if reference is None else file_of(reference, "reference")
     files = [camera, *([] if reference is None else [reference])]
     pose = None if reference is None else pose_in(reference)
     return ImagesInputs(camera_in(camera).lens, _openings(images), pose, tuple(files))

@@ -14,19 +14,10 @@ import msgspec
 import numpy as np
 
 from gripmon.model.geometry import from_record, invert, log_rotation, rotation_angle, to_vector
-from gripmon.model.mount import DIRECTIONS, afterwards, moves, summary
+from gripmon.model.mount import DIRECTIONS, Move, afterwards, moves, summary
 from gripmon.model.records import Array, CommandReply, FrameRecord, Mount, ReferenceRecord, Verdict
 
 _MONITOR = "monitor"
-
-
-class MountRow(msgspec.Struct, frozen=True):
-    """One bar of a page: see :class:`gripmon.model.mount.Move`."""
-
-    text: str
-    ends: tuple[str, str]
-    share: float
-    done: bool
 
 
 class MountView(msgspec.Struct, frozen=True):
@@ -39,7 +30,7 @@ class MountView(msgspec.Struct, frozen=True):
     placed: bool
     known: bool
     directions: str
-    rows: tuple[MountRow, ...]
+    rows: tuple[Move, ...]
     afterwards: str
 
 
@@ -47,10 +38,9 @@ def view_of(reply: CommandReply | None, robot: str, camera: str) -> MountView | 
     """The same for a page; None from a monitor that doesn't say how its camera is mounted."""
     if reply is None or (mount := reply.mount) is None:
         return None
-    rows = tuple(MountRow(*move) for move in moves(mount))
     target = f"{mount.reference_id} (revision {mount.revision})"
     known, after = mount.shift_m is not None, afterwards(reply, robot, camera)
-    return MountView(target, summary(mount), mount.placed, known, DIRECTIONS, rows, after)
+    return MountView(target, summary(mount), mount.placed, known, DIRECTIONS, moves(mount), after)
 
 
 def to_stand_at(references: Sequence[ReferenceRecord]) -> ReferenceRecord:

@@ -253,10 +253,10 @@ class Demo:
         """The daemon's exit code, and the summary, which is also written to ``out``; None if no frame was processed.
 
         ``step`` is called for each transform that arrives, ``on_network`` when the client has joined; ``stop``: see
-        :func:`gripmon.daemon.starting.run_monitor`.
+        :class:`gripmon.daemon.starting.RunOptions`.
         """
         from gripmon.daemon.service import log_to_stderr
-        from gripmon.daemon.starting import run_monitor
+        from gripmon.daemon.starting import RunOptions, run_monitor
 
         source = self._config.settings.source
         assert isinstance(source, SimulatedSettings), "checked before"
@@ -272,10 +272,11 @@ class Demo:
                 on_network()
 
             log_to_stderr()
-            code = run_monitor(
-                self._config, out=out, stop=stop, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=joined,
-                view=view,
+            options = RunOptions(
+                out=out, stop=stop, keep_state=False, view=view, on_network=joined, recording_name="demo",
+                truth_tcp_m=truth_tcp_m,
             )  # fmt: skip
+            code = run_monitor(self._config, options)
         return code, _summarise(out, self._simulator, receiver.count, live=source.realtime)
 
 

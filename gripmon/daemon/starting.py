@@ -9,6 +9,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,102 +42,77 @@ _SERVER_STARTS_S = 60.0
 _LOOK_EVERY_S = 0.1
 
 
-def run_file(
-    path: Path,
-    *,
-    out: Path | None,
-    stop: StopRequest,
-    duration_s: float | None = None,
-    verbose: bool = False,
-    log_json: bool = False,
-    fresh_state: bool = False,
-    view: str | None = None,
-    take_over: bool = False,
-) -> int:
-    """Run the daemon on a configuration file; returns the exit code.
+@dataclass(frozen=True)
+class RunOptions:
+    """How a configuration is run.
 
-    ``out``: a folder for the recording and ``estimates.jsonl``, created if missing.  ``view``:
-    "auto", "web", "native" or "server"; ``verbose`` and ``log_json``: see
-    :func:`gripmon.daemon.service.log_to_stderr`; the rest as in :func:`run_monitor`.
+    ``out``: a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
+    :func:`gripmon.model.stopping.signals_exit`, inside which a program with a terminal runs it.  ``keep_state``: the
+    state that survives a restart is read from the configuration's state file, unless ``fresh_state``, and written
+    there; and a warning is logged if the view can't meet the alert limits.  ``view``: show it live, "auto", "web",
+    "native" or "server"; ``take_over``: see :class:`gripmon.daemon.network.Network`.  ``on_network`` is called when the
+    publisher is open, before the camera is; ``truth_tcp_m``, of a simulation: the TCP's true position in the camera
+    frame for a frame's ``seq``, for the recording.
+    """
+
+    out: Path | None = None
+    stop: StopRequest | None = None
+    duration_s: float | None = None
+    keep_state: bool = True
+    fresh_state: bool = False
+    view: str | None = None
+    take_over: bool = False
+    on_network: Callable[[], None] = lambda: None
+    recording_name: str | None = None
+    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None
+
+
+def run_file(path: Path, options: RunOptions, *, verbose: bool = False, log_json: bool = False) -> int:
+    """Run the daemon on a configuration file; returns the exit code.  The folder for output is created if missing;
+    ``verbose`` and ``log_json``: see :func:`gripmon.daemon.service.log_to_stderr`.
     """
     config = load_config(path)
     look_ahead(config)
-    if out is not None:
-        lines = writable_folder(out) / "estimates.jsonl"
+    if options.out is not None:
+        lines = writable_folder(options.out) / "estimates.jsonl"
         try:
             lines.open("ab").close()
         except OSError as error:
             raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
     log_to_stderr(verbose=verbose, as_json=log_json)
-    return run_monitor(
-        config, out=out, stop=stop, duration_s=duration_s, keep_state=True, fresh_state=fresh_state,
-        view=view, take_over=take_over,
-    )  # fmt: skip
+    return run_monitor(config, options)
 
 
-def run_monitor(
-    config: Config,
-    *,
-    out: Path | None,
-    stop: StopRequest | None = None,
-    duration_s: float | None = None,
-    recording_name: str | None = None,
-    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
-    on_network: Callable[[], None] = lambda: None,
-    keep_state: bool = False,
-    fresh_state: bool = False,
-    view: str | None = None,
-    take_over: bool = False,
-) -> int:
+def run_monitor(config: Config, options: RunOptions) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
-    ``out``: a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
-    :func:`gripmon.model.stopping.signals_exit`, inside which a program with a terminal calls this.  ``truth_tcp_m``, of
-    a simulation: the TCP's true position in the camera frame for a frame's ``seq``, for the recording.  ``on_network``
-    is called when the publisher is open, before the camera is.  ``keep_state``: the state that survives a restart is
-    read from the configuration's state file, unless ``fresh_state``, and written there; and a warning is logged if the
-    view can't meet the alert limits.  ``view``: show it live; ``take_over``: see
-    :class:`gripmon.daemon.network.Network`.
-
-    Raises :class:`InputError` for anything that can't be opened as configured or written to ``out``.
+    Raises :class:`InputError` for anything that can't be opened as configured or written.
     """
-    settings = config.settings
+    settings, out = config.settings, options.out
     cv2.setNumThreads(1)
-    if keep_state and (text := limits_warning(config)) is not None:
-        _log.warning("%s", text)
-    if keep_state and (text := reference_doubt(settings)) is not None:
-        _log.warning("%s: %s", config.path, text)
-    live = None if view is None else LiveView(settings.view, view, config.path)
+    if options.keep_state:
+        _warn(config)
+    live = None if options.view is None else LiveView(settings.view, options.view, config.path)
     with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
-        kept = _open_state(config, fresh=fresh_state) if keep_state else None
+        kept = _open_state(config, opened, fresh=options.fresh_state) if options.keep_state else None
         if kept is not None:
-            opened.callback(kept.close)
             config = dataclasses.replace(config, reference=kept.configured)
-        state = None if kept is None else kept.state
         keeper = StateKeeper(kept)
-        monitor = Monitor(config, state, keeper.references)
-        for refused in (monitor.strips_refused, monitor.since_refused):
-            if refused is not None:
-                _log.warning("%s", refused)
-        network = Network(config, take_over=take_over)
+        monitor = _monitor(config, None if kept is None else kept.state, keeper)
+        network = Network(config, take_over=options.take_over)
         opened.callback(network.close)
-        on_network()
-        compiled = warm_up()  # before the first frame
-        # The loop's own collection skips what was made so far; collecting that first took 0.06 s and freed nothing.
-        gc.freeze()
-        source = open_configured(config, network.link)
+        options.on_network()
+        source = _open_source(config, network)
         opened.callback(source.close)
-        if compiled:
-            _log.info("%s", compiled)
         recorder = _open_recorder(
             config, out, source, live, camera=config.camera, gripper=config.gripper, reference=monitor.reference,
-            name=recording_name, truth_tcp_m=truth_tcp_m, configuration=to_recorded(config, state),
+            name=options.recording_name, truth_tcp_m=options.truth_tcp_m,
+            configuration=to_recorded(config, None if kept is None else kept.state),
         )  # fmt: skip
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
         opened.pop_all()  # from here on the daemon closes them
-        network.report_on(source)
         return run(
             monitor,
             source=source,
@@ -150,11 +127,40 @@ def run_monitor(
             commands=network.commands,
             reports=network.reports,
             notices=_notices(kept),
-            duration_s=duration_s,
-            stop=stop,
-            outlines=lambda transform, opening_m: _outlines(config, transform, opening_m),
-            odd_about=lambda image: unlike_light(config, image),
+            duration_s=options.duration_s,
+            stop=options.stop,
+            outlines=partial(_outlines, config),
+            odd_about=partial(unlike_light, config),
         )
+
+
+def _warn(config: Config) -> None:
+    """Log why no transform may be valid, or none as good as it claims."""
+    if (text := limits_warning(config)) is not None:
+        _log.warning("%s", text)
+    if (text := reference_doubt(config.settings)) is not None:
+        _log.warning("%s: %s", config.path, text)
+
+
+def _monitor(config: Config, state: MonitorState | None, keeper: StateKeeper) -> Monitor:
+    """The monitor as it was left, with a line for what couldn't be taken up again."""
+    monitor = Monitor(config, state, keeper.references)
+    for refused in (monitor.strips_refused, monitor.since_refused):
+        if refused is not None:
+            _log.warning("%s", refused)
+    return monitor
+
+
+def _open_source(config: Config, network: Network) -> Source:
+    """The source of frames, once the code that processes them is compiled."""
+    compiled = warm_up()
+    # The loop's own collection skips what was made so far; collecting that first took 0.06 s and freed nothing.
+    gc.freeze()
+    source = open_configured(config, network.link)
+    if compiled:
+        _log.info("%s", compiled)
+    network.report_on(source)
+    return source
 
 
 def _outlines(config: Config, cam_T_grip: Array | None, jaw_opening_m: float | None) -> Outlines:
@@ -163,8 +169,8 @@ def _outlines(config: Config, cam_T_grip: Array | None, jaw_opening_m: float | N
     return outlines_of(config.camera, config.gripper, cam_T_grip, jaw_opening_m)
 
 
-def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
-    """The state file; None without one."""
+def _open_state(config: Config, opened: contextlib.ExitStack, *, fresh: bool) -> StateFile | None:
+    """The state file, which ``opened`` closes; None without one."""
     path = config.state_path
     if path is None:
         return None
@@ -172,6 +178,7 @@ def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
         kept = StateFile(path, config.state_owner, config.reference, fresh=fresh)
     except StateFileError as error:
         raise ConfigError(config.path, "state.file", str(error)) from None
+    opened.callback(kept.close)
     if kept.configured.revision != config.reference.revision:
         # The file that knew the revisions was set aside, and what follows may fail, e.g. opening the camera.
         kept.write(MonitorState((kept.configured,)))

@@ -47,7 +47,7 @@ class CheckSettings:
     axis); share of spots that may be a reflection or no spot at all; probability from which a cause is named.
     """
 
-    false_alarms_per_1000_pulses: float = 0.1
+    false_alarms_per_1000_spots: float = 0.1
     arm_noise_m: float = 1e-4
     arm_noise_rad: float = 2e-4
     wrong_spots: float = 0.2
@@ -60,7 +60,7 @@ class CheckSettings:
 
     def false_alarm_chance(self, spots: int) -> float:
         """The probability that this many spots show a motion though nothing has moved."""
-        return 1e-3 * self.false_alarms_per_1000_pulses * spots
+        return 1e-3 * self.false_alarms_per_1000_spots * spots
 
 
 class SpotFault(StrEnum):

@@ -30,7 +30,7 @@ class SpotSigma(msgspec.Struct, frozen=True):
 class Noticed(msgspec.Struct, frozen=True):
     """Motions of ``base_T_cam`` (base axes) that this many spots show on average."""
 
-    pulses: int
+    spots: int
     position_m: tuple[float, ...]
     rotation_rad: tuple[float, ...]
 

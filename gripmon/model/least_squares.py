@@ -36,13 +36,10 @@ _DETERMINED = 1e13
 
 @dataclass(frozen=True, slots=True)
 class Minimum(Generic[S]):
-    """Result of a minimisation: the best ``state`` with its ``cost``; ``converged`` is False if the iterations
-    ran out before the cost settled.
-    """
+    """Result of a minimisation: the best ``state`` with its ``cost``, also where the iterations ran out."""
 
     state: S
     cost: float
-    converged: bool
 
 
 def chi_square_limit(chance: float, dimensions: int = 6) -> float:
@@ -95,13 +92,13 @@ def minimise(
             if new < current:
                 break
             if damping >= _MOST_DAMPING or step @ (wanted + damping * step) <= tolerance * current:
-                return Minimum(state, current, converged=True)
+                return Minimum(state, current)
             damping *= 10.0
         gain = current - new
         state, current, damping = trial, new, max(0.1 * damping, _LEAST_DAMPING)
         if gain <= tolerance * current:
-            return Minimum(state, current, converged=True)
-    return Minimum(state, current, converged=False)
+            break
+    return Minimum(state, current)
 
 
 def fit(

@@ -7,7 +7,8 @@ clockwise as seen from behind it.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+
+import msgspec
 
 from gripmon.model.records import CommandReply, Mount
 
@@ -20,7 +21,7 @@ _TURNS = (("turn down", "turn up"), ("turn left", "turn right"), ("turn anticloc
 _SHOWN_MM, _SHOWN_DEG = 0.005, 0.005  # less is shown as zero
 
 
-class Move(NamedTuple):
+class Move(msgspec.Struct, frozen=True):
     """One of six: what to do, in words; ``ends``: the words of both ways; ``share``: how much, positive towards the
     second, 1 for what alone would use up the alert limit; ``done``: no more than that.
     """

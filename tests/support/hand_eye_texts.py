@@ -137,3 +137,13 @@ FILES["moveit 1, among other nodes"] = MOVEIT_1.replace(
 FILES["static transform, in YAML with names"] = FILES["static transform, in YAML"].replace(
     "    pkg", "    name: static_transform_publisher cam\n    pkg"
 ).replace("launch:\n", "launch:\n- node: {pkg: a, exec: b, name: static_transform_publisher_b, args: 1 2 3}\n")
+# What isn't run is no node, and a name may hold what ends a list, a tag or a comment.
+_NOT_RUN = '''def before() -> None:
+    """Node(executable="static_transform_publisher", arguments=["--frame-id", "tool0", "--child-frame-id", "a_cam"])"""
+
+
+def generate'''
+FILES["moveit 2, with an old node in its text"] = MOVEIT_2.replace("def generate", _NOT_RUN, 1).replace(
+    '"--x",', '"--" "x",  # joined', 1
+)
+FILES["moveit 1, with a mark in a name"] = MOVEIT_1.replace("<node ", '<node if="$(eval 2 > 1)" ', 1)

@@ -21,14 +21,13 @@ from gripmon.daemon.config.checks import (
     network_fault,
     order_fault,
     predict_view,
-    reference_of,
     source_fault,
     view_fault,
 )
 from gripmon.daemon.config.earlier import without_gone
-from gripmon.daemon.config.project import file_of
+from gripmon.daemon.config.reference import reference_of
 from gripmon.daemon.config.settings import Settings
-from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
+from gripmon.daemon.config.typed import ConfigError, Fault, faults_of, to_settings
 from gripmon.daemon.config.yaml_file import builtin_config, named_file, read_configuration, read_settings
 from gripmon.io.sources import LiveSettings, NetworkSettings, Ros2CameraSettings, SimulatedSettings
 from gripmon.io.wire import Joining
@@ -36,6 +35,7 @@ from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
+from gripmon.model.project import file_of
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import TaughtEdges, TaughtModel
 from gripmon.track.edges.taught import mismatch, own_covariance
@@ -156,7 +156,7 @@ def load_config(
     that are gone only those that had an effect are told, for files that can't be edited.  ``text``: what the file will
     hold, and ``taught`` its taught model, where these aren't written yet.
     """
-    path = file_of(Path(path), "config")
+    path = file_of(path, "config")
     values = read_configuration(path, text)
     values, calibrated = with_sections(path, without_gone(path, values, say=say_gone))
     settings = read_settings(path, Settings, values)
@@ -199,10 +199,8 @@ def check_network(config: Config) -> Joining | None:
     Checks what matters only for joining it: Zenoh configuration files, endpoints, packages for ROS 2.  Raises
     :class:`ConfigError`.
     """
-    try:
+    with faults_of(config.path):
         return joined(config.settings, config.directory)
-    except SettingsError as error:
-        raise ConfigError.of(config.path, error.fault) from None
 
 
 def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Camera:
@@ -214,35 +212,30 @@ def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Cam
 
 def read_gripper(gripper_path: Path) -> Gripper:
     """Read and check a gripper file.  Raises :class:`ConfigError`."""
-    try:
-        model = read_settings(gripper_path, GripperModel)
-        # Checked first: points in millimetres break most other rules, too.
-        for name, point in model.points.items():
-            if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:
-                wrong = f"{max(map(abs, point.xyz_m)):g} m from the TCP"
-                raise ConfigError(gripper_path, f"points.{name}.xyz_m", wrong, "metres (millimetres were meant?)")
+    model = read_settings(gripper_path, GripperModel)
+    # Checked first: points in millimetres break most other rules, too.
+    for name, point in model.points.items():
+        if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:
+            wrong = f"{max(map(abs, point.xyz_m)):g} m from the TCP"
+            raise ConfigError(gripper_path, f"points.{name}.xyz_m", wrong, "metres (millimetres were meant?)")
+    with faults_of(gripper_path):
         for name, finger in model.fingers.items():
             for form, motion in (("axis", AxisMotion), ("table", TableMotion)):
                 if finger.motion is not None and set(finger.motion) == {form}:
                     to_settings(finger.motion, motion, f"fingers.{name}.motion")
+    try:
         return Gripper(model)
-    except SettingsError as error:
-        raise ConfigError.of(gripper_path, error.fault) from None
     except GripperError as error:
         raise ConfigError(gripper_path, "", str(error)) from None
 
 
 def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: CalibrationFiles) -> ReferenceRecord:
-    file = calibrated.paths.get("reference", path)
-    made = calibrated.hand_eye
+    file, made = calibrated.paths.get("reference", path), calibrated.hand_eye
     fault = None if made is None else calibrated_mismatch(made.camera, made.gripper, settings.camera, gripper)
     if fault is not None:
         raise ConfigError.of(file, fault)
-    try:
+    with faults_of(file, "reference." if file is path else ""):
         return reference_of(settings.reference)
-    except SettingsError as error:
-        key = error.fault.key if file is path else error.fault.key.removeprefix("reference.")
-        raise ConfigError.of(file, error.fault._replace(key=key)) from None
 
 
 def _with_taught(config: Config, model: TaughtModel | None = None) -> Config:

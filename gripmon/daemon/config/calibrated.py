@@ -13,7 +13,7 @@ import msgspec
 from gripmon.calibrate import camera_files
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration
 from gripmon.calibrate.foreign import UnknownFormatError
-from gripmon.daemon.config.robot_file import named_reference
+from gripmon.daemon.config.robot_file import RobotFile, reference_in
 from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import GivenFile, named_file, read_document
 from gripmon.model.camera import LensSettings
@@ -61,17 +61,15 @@ def _named_reference(config: Path, section: dict[str, Any]) -> tuple[Path, HandE
     if not isinstance(name, str):
         raise ConfigError(config, "reference.hand_eye", f"is {name!r}", _PLANE)
     file = GivenFile(named_file(config, "reference", name, _PLANE, _OR))
-    if not file.own:
-        return file.path, None, _as_read(named_reference(config, file, beside))
-    if beside:
+    if file.own and beside:
         wrong = f"stands beside {name}, a file of gripmon's that says it"
         raise ConfigError(config, f"reference.{next(iter(beside))}", wrong, f"reference: {name}")
-    made = read_document(file, HandEyeCalibration)
-    return file.path, made, {
-        "cam_T_grip": _as_read(made.cam_T_grip),
-        "covariance": list(made.covariance),
-        "with_gripper": made.with_gripper,
-    }  # fmt: skip
+    found = reference_in(file)
+    if isinstance(found, RobotFile):
+        where = f"{config}: reference: {{hand_eye: {file.path.name}, flange_T_tcp: …}}"
+        return file.path, None, _as_read(found.beside(config, beside).reference(where))
+    keys = ("cam_T_grip", "covariance", "with_gripper")
+    return file.path, found, {key: value for key, value in _as_read(found).items() if key in keys}
 
 
 def read_camera(file: Path | GivenFile) -> CameraCalibration:

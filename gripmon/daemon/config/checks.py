@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.hand_eye_formats import BODY_AXES, FARTHEST_M, lies_along_x, meant
-from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, Settings
+from gripmon.calibrate.hand_eye_formats import lies_along_x
+from gripmon.daemon.config.reference import ALONG_X, IN_FRONT, OPTICAL, covariance_of
+from gripmon.daemon.config.settings import JawSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
 from gripmon.io.ros2.node import Ros2Missing, check_rclpy, domain_of
@@ -31,23 +30,11 @@ from gripmon.io.sources import (
 from gripmon.io.sources.live import backend_number
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import UNIT_TOLERANCE, invert, make_transform, rotation_from_xyzw, to_record
+from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, ReferenceRecord, Transform, ValidBy, to_json
+from gripmon.model.records import Array, ValidBy
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.visibility import FEWEST_CORNERS
-
-_log = logging.getLogger(__name__)
-
-NEAREST_M = 0.005
-"""Least depth of the TCP in front of the camera: below it, another unit was meant."""
-
-_IN_FRONT = (
-    "z > 0 in front of the camera: cam_T_grip maps gripper coordinates to camera coordinates (the inverse was given?)"
-)
-
-_ALONG_X = f"along the camera's x: {BODY_AXES}"
-_OPTICAL = "the pose in the camera's optical frame, e.g. camera_color_optical_frame"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,35 +50,6 @@ class View:
     in_image: NDArray[np.bool_]
     visible: NDArray[np.bool_]
     edges_visible: NDArray[np.bool_]
-
-
-def reference_transform(settings: ReferenceSettings) -> Array:
-    """``cam_T_grip`` (4, 4) of a reference.  Raises :class:`SettingsError` if it is invalid."""
-    x, y, z, w = settings.cam_T_grip.rotation_xyzw
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    if abs(length - 1.0) > UNIT_TOLERANCE:
-        right = "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
-        raise SettingsError(Fault("reference.cam_T_grip.rotation_xyzw", f"has length {length:.4g}", right))
-    translation_m = np.array(settings.cam_T_grip.translation_m)
-    distance_m, depth_m = float(np.linalg.norm(translation_m)), float(translation_m[2])
-    wrong, right = "", "metres, e.g. [0.0, 0.0, 0.12]"
-    if distance_m > FARTHEST_M:
-        wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({meant(distance_m)})"
-    elif depth_m < NEAREST_M and lies_along_x(translation_m):
-        wrong, right = f"puts the TCP {_ALONG_X}", _OPTICAL
-    elif depth_m <= 0.0:
-        wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
-    elif depth_m < NEAREST_M:
-        wrong = f"puts the TCP {1e3 * depth_m:g} mm in front of the camera"
-    if wrong:
-        raise SettingsError(Fault("reference.cam_T_grip.translation_m", wrong, right))
-    return make_transform(rotation_from_xyzw((x, y, z, w)), translation_m)
-
-
-ASSUMED_SIGMA_M, ASSUMED_SIGMA_RAD = 0.001, 0.01
-"""Standard deviations of a reference that states none, per axis: hand/eye calibrations of laboratories are good to 1 to
-3 mm.
-"""
 
 
 def reference_doubt(settings: Settings) -> str | None:
@@ -124,43 +82,6 @@ def reference_doubt(settings: Settings) -> str | None:
                 f"{unit}; at least that, a reference that is known better, {right}"
             )
     return None
-
-
-def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
-    """The reference's covariance, row by row.  Raises :class:`SettingsError` if it is invalid."""
-    if settings.covariance is None:
-        sigma_m, sigma_rad = settings.position_sigma_m, settings.rotation_sigma_rad
-        sigma_m, sigma_rad = ASSUMED_SIGMA_M if sigma_m is None else sigma_m, sigma_rad or ASSUMED_SIGMA_RAD
-        variances = [sigma_m**2] * 3 + [sigma_rad**2] * 3
-        return tuple(np.diag(variances).ravel().tolist())
-    matrix = np.array(settings.covariance).reshape(6, 6)
-    scale, wrong = np.sqrt(np.abs(np.diag(matrix))), ""
-    if not (scale > 0.0).all():
-        wrong = "has a variance of zero"
-    else:
-        normalised = matrix / np.outer(scale, scale)
-        if np.abs(normalised - normalised.T).max() > 1e-6:
-            wrong = "is not symmetric"
-        elif np.linalg.eigvalsh(normalised).min() <= 0.0:
-            wrong = "is not positive definite"
-    if wrong:
-        right = "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)"
-        raise SettingsError(Fault("reference.covariance", wrong, right))
-    return settings.covariance
-
-
-def configured(
-    cam_T_grip: Transform, covariance: tuple[float, ...], name: str | None = None, *, with_gripper: bool = False
-) -> ReferenceRecord:
-    """A configuration's reference; without a name it is named by its transform."""
-    name = name or f"config-{hashlib.sha256(to_json(cam_T_grip)).hexdigest()[:8]}"
-    return ReferenceRecord(name, 0, 0, "configuration", cam_T_grip, covariance, with_gripper=with_gripper)
-
-
-def reference_of(settings: ReferenceSettings) -> ReferenceRecord:
-    """The reference of a configuration's section.  Raises :class:`SettingsError` if it is invalid."""
-    cam_T_grip, covariance = to_record(reference_transform(settings)), covariance_of(settings)
-    return configured(cam_T_grip, covariance, settings.id, with_gripper=settings.with_gripper)
 
 
 def monitor_fault(settings: MonitorSettings) -> Fault | None:
@@ -197,12 +118,12 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
     key = "reference.cam_T_grip"
     depths_m = view.corners_cam_m[:, 2]
     if not view.in_image.any() and lies_along_x(view.corners_cam_m.mean(axis=0)):  # a wide lens may see it there
-        return Fault(key, f"puts all corners outside of the image, {_ALONG_X}?", _OPTICAL)
+        return Fault(key, f"puts all corners outside of the image, {ALONG_X}?", OPTICAL)
     if (depths_m <= 0.0).all():
-        return Fault(key, "puts all corners of the gripper behind the camera", _IN_FRONT)
+        return Fault(key, "puts all corners of the gripper behind the camera", IN_FRONT)
     if (depths_m <= 0.0).any():
         name = gripper.landmark_ids[int(depths_m.argmin())]
-        return Fault(key, f"puts corner {name} behind the camera (z = {depths_m.min():.4g} m)", _IN_FRONT)
+        return Fault(key, f"puts corner {name} behind the camera (z = {depths_m.min():.4g} m)", IN_FRONT)
     if not view.in_image.any():
         u, v = np.nanmedian(view.corners_px, axis=0) if np.isfinite(view.corners_px).any() else (math.nan, math.nan)
         where = f"around ({u:.0f}, {v:.0f}) px" if math.isfinite(u) else "beyond what the lens maps"
@@ -294,7 +215,7 @@ def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
         try:
             backend_number(source)
         except SourceError as error:
-            return _split(f"source.{error}")
+            return Fault("", f"source.{error}", "")
     return None
 
 
@@ -334,7 +255,7 @@ def joined(settings: Settings, directory: Path) -> Joining | None:
     try:
         return joining(settings.publish, directory) if settings.publish.enabled else None
     except PublishError as error:
-        raise SettingsError(_split(str(error))) from None
+        raise SettingsError(Fault("", str(error), "")) from None
 
 
 def _ros2_missing(settings: Settings) -> Fault | None:
@@ -349,13 +270,5 @@ def _ros2_missing(settings: Settings) -> Fault | None:
             check_rclpy()
             domain_of(domain_id)
         except Ros2Missing as error:
-            wrong, _, right = str(error).partition("; ")
-            return Fault(key, wrong, right)
+            return Fault(key, str(error), "")
     return None
-
-
-def _split(text: str) -> Fault:
-    """The fault in a line ``key: what is wrong; what would be right``."""
-    key, _, rest = text.partition(": ")
-    wrong, _, right = rest.partition("; ")
-    return Fault(key, wrong, right)

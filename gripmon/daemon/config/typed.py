@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -22,7 +24,7 @@ _T = TypeVar("_T")
 
 
 class Fault(NamedTuple):
-    """What is wrong at a key, and what would be right."""
+    """What is wrong at a key, and what would be right; another room's line that says both stands in ``wrong`` alone."""
 
     key: str
     wrong: str
@@ -48,6 +50,15 @@ class ConfigError(InputError):
     def of(cls, path: Path, fault: Fault) -> ConfigError:
         """With what is wrong at a key of this file."""
         return cls(path, *fault)
+
+
+@contextmanager
+def faults_of(path: Path, prefix: str = "") -> Iterator[None]:
+    """A :class:`SettingsError` in it is a :class:`ConfigError` of this file, at a key below ``prefix``."""
+    try:
+        yield
+    except SettingsError as error:
+        raise ConfigError(path, f"{prefix}{error.fault.key}", error.fault.wrong, error.fault.right) from None
 
 
 def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:

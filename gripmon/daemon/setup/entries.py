@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.daemon.config.project import FILES
 from gripmon.daemon.targets import target_of
 from gripmon.model.errors import InputError
+from gripmon.model.project import FILES
 from gripmon.model.targets import OtherSizeError, Target, TargetError, name_of, parse_target, refuse_other_size
 
 Values = Mapping[str, str]

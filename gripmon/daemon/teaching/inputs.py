@@ -17,8 +17,8 @@ from gripmon.calibrate.bundle import GivenCamera
 from gripmon.daemon.calibrations import camera_in, given_file, pose_of, read_calibrated
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch
-from gripmon.daemon.config.checks import configured, covariance_of, predict_view, reference_transform, view_fault
-from gripmon.daemon.config.project import file_of, files_of
+from gripmon.daemon.config.checks import predict_view, view_fault
+from gripmon.daemon.config.reference import configured, covariance_of, reference_transform
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import GivenFile, read_settings, read_yaml
@@ -87,7 +87,6 @@ def read_inputs(
     deviation.
     """
     cv2.setNumThreads(1)
-    camera, gripper, reference = files_of(camera=camera, gripper=gripper, reference=reference).values()
     given = None
     named = {key: given_file(path) for key, path in (("camera", camera), ("reference", reference)) if path is not None}
     if config is not None:
@@ -152,7 +151,6 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 def outline_page(image: Path, camera: Path | None, folder: Path, back: str | None = None) -> OutlineSite:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, saved in ``folder``."""
     shown, target = image_in(image), None
-    camera = None if camera is None else file_of(camera, "camera")
     if camera is not None:
         with contextlib.suppress(ConfigError):  # camera_in reports what is wrong
             target = read_yaml(camera).get("target")

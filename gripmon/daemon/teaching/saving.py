@@ -13,13 +13,13 @@ from gripmon import __version__
 from gripmon.calibrate.detection import BLURRED_PX
 from gripmon.calibrate.grey_levels import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
-from gripmon.daemon.config.project import FILES
 from gripmon.daemon.config.writing import with_taught
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
 from gripmon.daemon.teaching.written import config_text
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.project import FILES
 from gripmon.model.records import ReferenceRecord
 from gripmon.model.response import ResponseSeen
 from gripmon.model.yaml_text import yaml_value
