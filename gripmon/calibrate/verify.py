@@ -6,7 +6,6 @@ sum of their covariances, so that differences then look less significant than th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,9 +18,9 @@ from gripmon.calibrate.bundle import GivenCamera, independent_errors
 from gripmon.calibrate.documents import CalibratedGripper
 from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
-from gripmon.model.geometry import from_record, perturb, perturbation_between
+from gripmon.model.geometry import from_record, perturb, perturbation_between, skew
 from gripmon.model.least_squares import whitening
 from gripmon.model.records import Array, Transform
 
@@ -64,8 +63,8 @@ class HandEyeDifference:
     """Difference of two ``cam_T_grip``, second against first: the TCP's ``position_m`` (3,) and the ``rotation_rad``
     (3,) vector along the camera's axes, with standard deviations.
 
-    ``chi2`` has six degrees of freedom; ``p_value`` is the probability of one as large if both are the same,
-    ``position_p`` and ``rotation_p`` those of the parts alone.
+    ``p_value``: probability of a ``chi2`` as large if both are the same, ``position_p_value`` and ``rotation_p_value``
+    those of the parts alone.
     """
 
     position_m: Array
@@ -74,8 +73,10 @@ class HandEyeDifference:
     rotation_sigma_rad: Array
     chi2: float
     p_value: float
-    position_p: float
-    rotation_p: float
+    position_p_value: float
+    rotation_p_value: float
+    degrees_of_freedom: int = 6
+    kind: str = "hand_eye"
 
 
 def compare_hand_eye(
@@ -91,18 +92,20 @@ def compare_hand_eye(
     for name, matrix in (("first", a_covariance), ("second", b_covariance)):
         if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
             raise CalibrationError(f"the {name} covariance isn't symmetric; one of errors")
-    xi = perturbation_between(a_cam_T_grip, b_cam_T_grip)
-    covariance = a_covariance + b_covariance
-    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    xi, covariance = perturbation_between(a_cam_T_grip, b_cam_T_grip), a_covariance + b_covariance
+    whole, position, rotation = (
+        _chi2(xi[part], covariance[part, part]) for part in (slice(6), slice(3), slice(3, 6))
+    )
+    sigma = np.sqrt(covariance.diagonal())
     return HandEyeDifference(
         position_m=xi[:3],
         position_sigma_m=sigma[:3],
         rotation_rad=xi[3:],
         rotation_sigma_rad=sigma[3:],
-        chi2=_chi2(xi, covariance),
-        p_value=float(chdtrc(6, _chi2(xi, covariance))),
-        position_p=float(chdtrc(3, _chi2(xi[:3], covariance[:3, :3]))),
-        rotation_p=float(chdtrc(3, _chi2(xi[3:], covariance[3:, 3:]))),
+        chi2=whole,
+        p_value=float(chdtrc(6, whole)),
+        position_p_value=float(chdtrc(3, position)),
+        rotation_p_value=float(chdtrc(3, rotation)),
     )
 
 
@@ -111,9 +114,8 @@ def _chi2(difference: Array, covariance: Array) -> float:
     if not (sigma > 0.0).all():
         raise CalibrationError("the uncertainties are zero; covariances of the errors")
     # In units of the standard deviations: with metres and radians any matrix would look singular.
-    correlation = covariance / np.outer(sigma, sigma)
     try:
-        root = np.linalg.cholesky(correlation)
+        root = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
     except np.linalg.LinAlgError:
         raise CalibrationError("the uncertainties leave a direction exactly known; full covariances") from None
     return float(np.sum(np.square(np.linalg.solve(root, difference / sigma))))
@@ -161,30 +163,9 @@ class Verdict:
 
     def values(self) -> dict[str, Any]:
         """As plain values: m, rad, px."""
-        found = self.difference
-        parts = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(found).items()
-        }
-        if isinstance(found, HandEyeDifference):
-            more = {f"{part}_p_value": parts.pop(f"{part}_p") for part in ("position", "rotation")}
-            difference = {"kind": "hand_eye", **parts, "degrees_of_freedom": 6, **more}
-        else:
-            known = found.p_value is not None
-            difference = {"kind": "camera", **parts, "largest_sigma_px": found.largest_sigma_px if known else None}
-        within = {"within_tolerance": self.within, "same": self.same, "level": self.level}
-        return {**difference, **within, "warnings": list(self.warnings)}
-
-    def summary(self, *, given: bool) -> list[str]:
-        """For a person, the verdict last; ``given``: with a tolerance."""
-        apart, level = self.difference, f"at a level of {self.level:g}"
-        lines = _hand_eye_lines(apart) if isinstance(apart, HandEyeDifference) else _camera_lines(apart)
-        if self.same and self.within:
-            verdict = "same: within the tolerance" if given else "same: the difference is negligible"
-        elif not self.same and apart.p_value is None:
-            verdict = "different: beyond the tolerance"
-        else:
-            verdict = f"same (not distinguished {level})" if self.same else f"different ({level})"
-        return [*lines, *(f"warning: {warning}" for warning in self.warnings), verdict]
+        parts = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self.difference).items()}
+        verdict = {"within_tolerance": self.within, "same": self.same, "level": self.level}
+        return {**parts, **verdict, "warnings": list(self.warnings)}
 
 
 def verify(
@@ -264,18 +245,19 @@ class CameraDifference:
     ``largest_px`` with its standard deviation along the difference, at ``at_px`` (2,) of the first image; ``rms_px``
     over the image.  ``turn_rad`` (3,): the rotation of the camera about its axes that explains most of it, and
     ``largest_turned_px`` the largest difference after it: a hand/eye calibration made with each would absorb that
-    rotation.  ``p_value``: probability by chance of the most significant difference in the image; None if neither
-    camera's uncertainty is known.  ``compared``: share of the image that both show.
+    rotation.  ``p_value``: probability by chance of the most significant difference in the image; None, like
+    ``largest_sigma_px``, if neither camera's uncertainty is known.  ``compared``: share of the image that both show.
     """
 
     largest_px: float
-    largest_sigma_px: float
+    largest_sigma_px: float | None
     at_px: Array
     rms_px: float
     turn_rad: Array
     largest_turned_px: float
     p_value: float | None
     compared: float
+    kind: str = "camera"
 
 
 def compare_cameras(a: GivenCamera, b: GivenCamera) -> CameraDifference:
@@ -292,53 +274,52 @@ def compare_cameras(a: GivenCamera, b: GivenCamera) -> CameraDifference:
             "one size"
         )
     camera_a, camera_b = make_camera(a.lens), make_camera(b.lens)
-    grid_px = _grid(size)
+    grid_px = np.stack(np.meshgrid(*(np.linspace(0.0, n - 1.0, _GRID) for n in size)), axis=-1).reshape(-1, 2)
     xy = camera_a.undistort(grid_px)
-    shown = np.isfinite(xy).all(axis=1)
     apart_px = np.full_like(grid_px, np.nan)
+    shown = np.isfinite(xy).all(axis=1)
     apart_px[shown] = camera_b.distort(xy[shown]) - grid_px[shown]
     both = np.isfinite(apart_px).all(axis=1)
     if np.count_nonzero(both) < 0.5 * len(grid_px):
         raise CalibrationError("less than half of the image is seen by both lens models; calibrations of one camera")
-    uv_px, xy, apart_px = grid_px[both], xy[both], apart_px[both]
-    roots = np.concatenate([_root(a, xy), -_root(b, xy)], axis=2)
-    covariance = roots @ roots.transpose(0, 2, 1)
+    uv_px, apart_px = grid_px[both], apart_px[both]
+    rays = np.column_stack([xy[both], np.ones(len(uv_px))])
+    roots = np.concatenate([_root(a, rays), -_root(b, rays)], axis=2)
     length = np.linalg.norm(apart_px, axis=1)
     worst = int(np.argmax(length))
     along = apart_px[worst] / max(length[worst], 1e-300)
-    turn_rad, left_px = _turned(camera_b, xy, apart_px)
+    known = roots.shape[2] > 0
+    # A turn of the camera by omega moves a ray p by omega x p.
+    by_turn = (-camera_b.project_with_jacobian(rays)[1] @ skew(rays)).reshape(-1, 3)
+    turn_rad: Array = np.linalg.lstsq(by_turn, apart_px.ravel(), rcond=None)[0]
+    left_px = apart_px - (by_turn @ turn_rad).reshape(-1, 2)
     return CameraDifference(
         largest_px=float(length[worst]),
-        largest_sigma_px=float(np.sqrt(along @ covariance[worst] @ along)),
+        largest_sigma_px=float(np.linalg.norm(along @ roots[worst])) if known else None,
         at_px=uv_px[worst],
         rms_px=float(np.sqrt(np.mean(np.square(length)))),
         turn_rad=turn_rad,
         largest_turned_px=float(np.linalg.norm(left_px, axis=1).max()),
-        p_value=_chance(apart_px, covariance, roots) if roots.shape[2] else None,
+        p_value=_chance(apart_px, roots) if known else None,
         compared=len(uv_px) / len(grid_px),
     )
 
 
-def _grid(size: tuple[int, int]) -> Array:
-    """Pixels (n, 2) over the whole image."""
-    columns, rows = (np.linspace(0.0, n - 1.0, _GRID) for n in size)
-    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-
-
-def _root(calibrated: GivenCamera, xy: Array) -> Array:
+def _root(calibrated: GivenCamera, rays: Array) -> Array:
     """(n, 2, p): effect of independent unit errors in the parameters on each pixel."""
     if calibrated.covariance is None or not calibrated.parameters:
-        return np.zeros((len(xy), 2, 0))
-    points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    _, by_parameters, _ = calibrated.model.project(lens_vector(calibrated.lens), points)
+        return np.zeros((len(rays), 2, 0))
+    _, by_parameters, _ = calibrated.model.project(lens_vector(calibrated.lens), rays)
     out: Array = by_parameters @ calibrated.free @ independent_errors(calibrated.covariance).T
     return out
 
 
-def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
-    """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), by sampling errors."""
+def _chance(apart_px: Array, roots: Array) -> float:
+    """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), by sampling errors with the
+    effects ``roots`` (n, 2, p).
+    """
     # Directions that neither camera left free have no variance: add a thousandth of a pixel.
-    inverse_root = whitening(covariance + NEGLIGIBLE_PX**2 * np.eye(2))
+    inverse_root = whitening(roots @ roots.transpose(0, 2, 1) + NEGLIGIBLE_PX**2 * np.eye(2))
     observed = np.square(inverse_root @ apart_px[:, :, None]).sum(axis=(1, 2)).max()
     whitened = inverse_root @ roots
     draws = np.random.default_rng(_SEED).standard_normal((whitened.shape[2], _DRAWS))
@@ -346,53 +327,3 @@ def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
     for place in whitened:
         np.maximum(largest, np.square(place @ draws).sum(axis=0), out=largest)
     return float((1 + np.count_nonzero(largest >= observed)) / (1 + _DRAWS))
-
-
-def _turned(camera: Camera, xy: Array, apart_px: Array) -> tuple[Array, Array]:
-    """The rotation of the camera (3,), rad, that explains most of the differences (n, 2), and what is left of them."""
-    points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    _, by_point = camera.project_with_jacobian(points)
-    # omega x p, column by column
-    zero, x, y, z = np.zeros(len(xy)), points[:, 0], points[:, 1], points[:, 2]
-    by_turn = np.stack(
-        [np.stack([zero, -z, y], axis=1), np.stack([z, zero, -x], axis=1), np.stack([-y, x, zero], axis=1)], axis=2
-    )
-    matrix = (by_point @ by_turn).reshape(-1, 3)
-    turn: Array = np.linalg.lstsq(matrix, apart_px.ravel(), rcond=None)[0]
-    return turn, apart_px - (matrix @ turn).reshape(-1, 2)
-
-
-def _hand_eye_lines(found: HandEyeDifference) -> list[str]:
-    shift_mm = 1e3 * math.hypot(*found.position_m.tolist())
-    turn_deg = math.degrees(math.hypot(*found.rotation_rad.tolist()))
-    lines = ["second less first, camera axes    " + "".join(f"{axis:<19}" for axis in "xyz").rstrip()]
-    rows = (
-        ("TCP (mm)", 1e3 * found.position_m, 1e3 * found.position_sigma_m),
-        ("rotation (deg)", found.rotation_rad * 180.0 / math.pi, found.rotation_sigma_rad * 180.0 / math.pi),
-    )
-    for name, values, sigmas in rows:
-        cells = "".join(f"{v:+9.4f} ± {s:<7.4f}" for v, s in zip(values.tolist(), sigmas.tolist(), strict=True))
-        lines.append(f"{name:<28}{cells}".rstrip())
-    turn = f"{turn_deg:.4f} degrees ({_probability(found.rotation_p)})"
-    lines.append(f"together {shift_mm:.4f} mm at the TCP ({_probability(found.position_p)}), {turn}")
-    lines.append(f"chi-square {found.chi2:.2f} of 6 degrees of freedom: {_probability(found.p_value)} by chance")
-    return lines
-
-
-def _probability(probability: float) -> str:
-    return "probability below 1e-9" if probability < 1e-9 else f"probability {probability:.2g}"
-
-
-def _camera_lines(found: CameraDifference) -> list[str]:
-    u, v = found.at_px.tolist()
-    sigma = "" if found.p_value is None else f" ± {found.largest_sigma_px:.3f}"
-    degrees = ", ".join(f"{math.degrees(turn):+.4f}" for turn in found.turn_rad.tolist())
-    lines = [
-        f"largest difference {found.largest_px:.3f}{sigma} px, at ({u:.0f}, {v:.0f}); rms {found.rms_px:.3f} px",
-        f"a hand/eye calibration absorbs a turn by ({degrees}) degrees: {found.largest_turned_px:.3f} px are left",
-    ]
-    if found.p_value is not None:
-        lines.append(f"{_probability(found.p_value)} by chance")
-    if found.compared < 1.0:
-        lines.append(f"compared where both lenses map the image: {100.0 * found.compared:.0f} %")
-    return lines

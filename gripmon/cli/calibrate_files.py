@@ -9,15 +9,16 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from gripmon.cli import render
 from gripmon.cli.common import REQUIRED, Arguments, Command, note, positive_number
 from gripmon.model.errors import InputError, input_errors
 from gripmon.model.project import file_of
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.verify import Calibrated
+    from gripmon.calibrate.verify import Calibrated, Verdict
 
 DEFAULT_LEVEL = 0.01
 
@@ -86,8 +87,36 @@ def verify(arguments: Arguments) -> int:
     if arguments.json:
         print(json.dumps(found.values() | {"within_tolerance": found.within if given else None}))
     else:
-        print("\n".join(found.summary(given=given)))
+        print("\n".join(_lines(found, given=given)))
     return EXIT_DONE if found.same else EXIT_FAILED
+
+
+def _lines(found: Verdict, *, given: bool) -> list[str]:
+    """For a person, the verdict last; ``given``: with a tolerance."""
+    apart, level = found.difference, f"at a level of {found.level:g}"
+    if found.same and found.within:
+        verdict = "same: within the tolerance" if given else "same: the difference is negligible"
+    elif not found.same and apart.p_value is None:
+        verdict = "different: beyond the tolerance"
+    else:
+        verdict = f"same (not distinguished {level})" if found.same else f"different ({level})"
+    return [*_difference(found.values()), *(f"warning: {warning}" for warning in found.warnings), verdict]
+
+
+def _difference(values: dict[str, Any]) -> list[str]:
+    if values["kind"] == "camera":
+        names = {"largest_turned_px": "left_after_a_turn_of_the_camera_px", "turn_rad": "that_turn_rad"}
+        told = ("largest_px", "largest_sigma_px", "at_px", "rms_px", "largest_turned_px", "turn_rad")
+        shown = {names.get(key, key): values[key] for key in told}
+        share = {} if values["compared"] == 1.0 else {"share_of_the_image_compared": values["compared"]}
+        return render.lines(shown | {"probability_by_chance": _probability(values["p_value"])} | share)
+    columns = ("position_m", "position_sigma_m", "rotation_rad", "rotation_sigma_rad")
+    heads = ("second_less_first,_camera_axes", "TCP_m", "±_m", "turn_rad", "±_rad")
+    rows = [dict(zip(heads, row, strict=True)) for row in zip("xyz", *(values[key] for key in columns), strict=True)]
+    parts = {"tcp": "position_p_value", "turn": "rotation_p_value", "both": "p_value"}
+    chances = {part: _probability(values[key]) for part, key in parts.items()}
+    together = {"tcp_m": math.hypot(*values["position_m"]), "turn_rad": math.hypot(*values["rotation_rad"])}
+    return [*render.table(rows), *render.lines({"together": together, "probability_by_chance": chances})]
 
 
 def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[str, ...]]:
@@ -114,6 +143,10 @@ def _second(first: Calibrated, arguments: Arguments) -> tuple[Calibrated, tuple[
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(file_of(names[0], "reference")), ()
+
+
+def _probability(value: float | None) -> float | str | None:
+    return "below 1e-9" if value is not None and value < 1e-9 else value
 
 
 CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")

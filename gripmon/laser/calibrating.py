@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.robot_world import OFFSETS
+from gripmon.calibrate.robot_world import out_of_step
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
 from gripmon.laser.documents import LEAST_NOISE_PX
@@ -261,9 +261,6 @@ def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str, str]]:
     yield turned(w_first), everything, text, "qx, qy, qz, qw, in this order"
     text = "the rotations are the other way round: inverted, the spots fit"
     yield turned(turns.transpose(0, 2, 1)), everything, text, "base_R_ee"
-    for offset in OFFSETS:
-        count = len(base_T_ee) - abs(offset)
-        poses, spots = (slice(first, first + count) for first in (max(offset, 0), max(-offset, 0)))
-        which = "later" if offset > 0 else "earlier"
-        text = f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which}"
+    for rows, poses, spots in out_of_step(len(base_T_ee)):
+        text = f"poses and images are out of step: spots fit the poses {rows}"
         yield base_T_ee[poses], spots, text, "each spot with its own pose"

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibrate.robot_world import LEAST_TURN_RAD
+from gripmon.calibrate.robot_world import LEAST_TURN_RAD, least_turn_rad
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.plane_search import SUBSET, find_plane
 from gripmon.laser.setup import LaserSetup, basis, origin_axes
@@ -139,9 +139,7 @@ def _check_turns(base_R_ee: Array) -> None:
     """Reject rotations (M, 3, 3) that leave a direction of the end-effector fixed: the laser's position along it is
     then unobservable, because a shift of the base has the same effect.
     """
-    turns = (base_R_ee - base_R_ee.mean(axis=0)).reshape(-1, 3)
-    moved = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(base_R_ee))
-    if moved[2] < LEAST_TURN_RAD:
+    if least_turn_rad(base_R_ee) < LEAST_TURN_RAD:
         raise CalibrationError(
             f"{len(base_R_ee)} orientations, turned about one axis only: where the laser sits along it stays unknown; "
             "at least three orientations, turned about at least two axes"
