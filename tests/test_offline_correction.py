@@ -244,6 +244,26 @@ def test_short_recordings_give_finite_transforms_no_worse_than_the_frames(frames
     assert np.mean(errors) <= np.mean([rms(s.error[:, :3]) for s in streams])
 
 
+@pytest.mark.parametrize("frames", [4, 8, 31])
+def test_a_step_among_few_frames_is_not_smoothed_over(frames: int):
+    """Nothing looked for it: what was on either side was mixed, far beyond the covariance."""
+    stream = Stream(frames, 30, step_at(frames, frames // 2, 40.0 * STEP))
+    correction = stream.correct()
+    assert [point.index for point in correction.change_points] == [frames // 2]
+    error = difference(stream.true, correction.cam_T_grip)
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(correction.covariance), error)
+    assert (square < stats.chi2.isf(1e-4, 6)).all()
+
+
+def test_a_smaller_step_among_few_frames_is_in_the_covariance():
+    stream = Stream(8, 31, step_at(8, 4, 0.3 * STEP))
+    correction = stream.correct()
+    assert not correction.change_points and stream.stamp_ns[4] in correction.undecided_ns
+    error = difference(stream.true, correction.cam_T_grip)
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(correction.covariance), error)
+    assert (square < stats.chi2.isf(1e-4, 6)).all()
+
+
 def test_instants_between_frames_lie_between_and_say_so():
     stream = Stream(600, 11, step_at(600, 300, 20.0 * STEP))
     correction = stream.correct()

@@ -111,7 +111,9 @@ def _past(
     """
     frames = np.flatnonzero(track.measured)
     smooth = np.empty((len(frames), 6))
-    for part in runs_of_equal(group[frames]):  # a median must not mix two references
+    pauses = np.cumsum(np.diff(track.stamp_ns[frames], prepend=0) > SECOND_NS)
+    # A median must not mix two references, nor what is seconds apart.
+    for part in runs_of_equal(group[frames] + len(track.keys) * pauses):
         smooth[part] = median_filter(vectors[frames[part]], size=(_MEDIAN_FRAMES, 1), mode="nearest")
     size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
     turn = np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad
@@ -129,7 +131,13 @@ def _past(
             start = frame
     if start is not None:
         out.append((start, len(track) - 1))
-    return [(a, b) for a, b in out if int(track.measured[a : b + 1].sum()) > _MEDIAN_FRAMES // 2]
+    return [each for each in out if _lasts(track, *each)]
+
+
+def _lasts(track: Track, first: int, last: int) -> bool:
+    """Whether the measured frames of a period are more than a few outliers, or a second apart."""
+    stamps_ns = track.stamp_ns[first : last + 1][track.measured[first : last + 1]]
+    return len(stamps_ns) > _MEDIAN_FRAMES // 2 or int(np.ptp(stamps_ns)) >= SECOND_NS
 
 
 def _significant(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
@@ -147,9 +155,10 @@ def runs_of_equal(values: NDArray[np.int64] | NDArray[np.bool_]) -> list[slice]:
 def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacement:
     """The largest of the medians over a few frames each, robust against single outliers."""
     frames = first + np.flatnonzero(track.measured[first : last + 1])
-    blocks = [frames[i : i + _MEDIAN_FRAMES] for i in range(0, len(frames), _MEDIAN_FRAMES)]
-    if len(blocks) > 1 and len(blocks[-1]) < _MEDIAN_FRAMES // 2:
-        blocks.pop()
+    pauses = np.flatnonzero(np.diff(track.stamp_ns[frames]) > SECOND_NS) + 1
+    parts = np.split(frames, pauses)
+    blocks = [part[i : i + _MEDIAN_FRAMES] for part in parts for i in range(0, len(part), _MEDIAN_FRAMES)]
+    blocks = [block for block in blocks if len(block) >= _MEDIAN_FRAMES // 2] or blocks
     levels = np.array([np.median(vectors[block], axis=0) for block in blocks])
     i = int(np.argmax(np.linalg.norm(levels[:, :3], axis=1)))
     return displacement(levels[i], np.median(track.sigma[blocks[i]], axis=0))

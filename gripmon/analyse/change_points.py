@@ -68,15 +68,21 @@ def outlier_frames(run: Run) -> Bools:
 def find(run: Run) -> tuple[list[FoundChange], list[FoundChange]]:
     """The change points among the usable frames, in order; and those that are undecided: by no more than two
     backgrounds may differ, so that it was the pose or the background.  A gap before one is part of its interval.
+    Of fewer than four times :data:`SIDE_FRAMES` frames each is compared with the one before it.
     """
-    good = np.flatnonzero(run.usable)
+    good, largest = np.flatnonzero(run.usable), largest_background_change(run)
     y = run.y[good]
+    if len(good) < 4 * SIDE_FRAMES:  # too few for means: each frame may be the first after a change
+        jumps = (np.diff(y, axis=0) ** 2).sum(axis=1)
+        each = [FoundChange(i, i, i) for i in good[1:].tolist()]
+        clear = [change for change, jump in zip(each, jumps.tolist(), strict=True) if jump > largest]
+        return clear, [change for change in each if change not in clear]
     limit = float(6 * stats.f.isf(_chance(run), 6, MEAN_DOF))
     peaks, _ = signal.find_peaks(squared_changes(y), height=limit, distance=2 * SIDE_FRAMES)
     places = sorted((_place(y, peak) for peak in peaks.tolist()), key=lambda place: place.index)
     found: list[FoundChange] = []
     undecided: list[FoundChange] = []
-    before, largest = -SIDE_FRAMES, largest_background_change(run)
+    before = -SIDE_FRAMES
     for place in places:
         if place.index - before < SIDE_FRAMES:
             continue

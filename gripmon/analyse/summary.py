@@ -127,13 +127,10 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
 
 
 def _motion(event: Event, first: bool) -> str:
-    how = {AlertKind.STEP: "it moved at once", AlertKind.CREEP: "it began to creep"}.get(
-        AlertKind(event.kind), "it began to drift"
-    )
-    onset = event.onset
-    when = f"at {clock_time(onset.stamp_ns)}"
+    onset, step, when = event.onset, "it moved at once", f"at {clock_time(event.onset.stamp_ns)}"
     if onset.latest_ns - onset.earliest_ns > SECOND_NS // 2:
-        when = f"between {clock_time(onset.earliest_ns)} and {clock_time(onset.latest_ns)}"
+        step, when = "it moved", f"between {clock_time(onset.earliest_ns)} and {clock_time(onset.latest_ns)}"
+    how = {AlertKind.STEP: step, AlertKind.CREEP: "it began to creep"}.get(AlertKind(event.kind), "it began to drift")
     start = f"{when.capitalize() if first else f'Then, {when}'} {how}"
     by = f", the TCP by {size(event.moved)}" if event.moved else ""
     within = f", most of it within {duration(event.moved_in_s)}" if event.moved_in_s else ""
