@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from gripmon.io.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
-from gripmon.io.sources.live import Backlog, Backoff, shown_name
+from gripmon.io.sources.live import Backlog, shown_name
 from gripmon.model.records import Frame
 
 PERIOD_S = 0.02
@@ -278,14 +278,6 @@ def test_devices_of_no_known_form_are_refused(settings: LiveSettings, complaint:
 def test_a_pipeline_without_gstreamer_is_refused_with_the_reason():
     with pytest.raises(SourceError, match=r"^device: needs the gstreamer backend.*; a build of OpenCV with it"):
         open_source(LiveSettings(device="videotestsrc ! appsink"))
-
-
-def test_pauses_double_up_to_the_longest_and_start_again_after_success():
-    backoff = Backoff(0.5, 10.0)
-    assert [backoff.next_s() for _ in range(7)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
-    backoff.reset()
-    assert backoff.next_s() == 0.5
-    assert Backoff(5.0, 2.0).next_s() == 2.0
 
 
 def test_a_password_is_not_shown():

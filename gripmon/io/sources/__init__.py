@@ -17,7 +17,6 @@ from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings
 from gripmon.io.sources.lerobot import LeRobotSettings, LeRobotSource, is_lerobot
 from gripmon.io.sources.live import LiveCamera, LiveSettings
 from gripmon.io.sources.network import ArrivingCamera, NetworkCamera, NetworkSettings
-from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.ros2 import Ros2Camera, Ros2CameraSettings
 from gripmon.io.sources.simulated import SimulatedSettings, make_simulator, open_simulated
 from gripmon.io.wire import Keys, Link
@@ -51,7 +50,6 @@ __all__ = [
     "LiveSettings",
     "NetworkCamera",
     "NetworkSettings",
-    "NewestFrame",
     "OpenedSource",
     "Ros2Camera",
     "Ros2CameraSettings",

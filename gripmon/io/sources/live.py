@@ -10,13 +10,12 @@ from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
 
-from gripmon.io.sources.base import SourceError, Waiting
-from gripmon.io.sources.newest import NewestFrame
+from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.io.sources.newest import Newest
 from gripmon.io.sources.queued import Backlog
 from gripmon.model.records import Frame, Image
 
 _log = logging.getLogger(__name__)
-_PAUSE_S = 0.25  # longest wait of the reading thread between two checks of the clock
 
 Backend = Literal["v4l2", "ffmpeg", "gstreamer", "any"]
 Pixels = Annotated[int, msgspec.Meta(ge=16, le=20000)]
@@ -58,37 +57,113 @@ class LiveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     ] = 10.0
 
 
-class LiveCamera(NewestFrame):
+class LiveCamera:
     """The newest frame of a camera; while there is none it retries forever, and ``read`` returns :class:`Waiting`.
 
     ``stamp_ns`` is the Unix time of the frame's arrival here, before decoding; frames that queued up on the way while
     the camera was silent are dropped (:class:`Backlog`).  ``seq`` counts arrivals, so dropped frames leave gaps.
     Images are BGR.  A URL over HTTP is asked for JPEGs first; what it can do about size and rate stands in the URL.
+
+    A thread waits for the driver.  What it raises ends it; the next ``read`` raises that, after the last frame.
     """
 
-    def __init__(self, settings: LiveSettings) -> None:
-        self._camera = _CaptureReader(settings)
-        super().__init__(self._camera, name="camera")
+    live = True
+
+    def __init__(self, settings: LiveSettings, *, close_within_s: float = 0.5) -> None:
+        """``close_within_s``: after it, a driver that has not returned is left behind."""
+        self._settings = settings
+        self._name = shown_name(settings.device)
+        self._api = backend_number(settings)
+        self._close_within_s = close_within_s
+        self._newest: Newest[Frame] = Newest()
+        self._waiting = f"{self._name}: connecting"
+        self._fault: BaseException | None = None
+        self._stop = threading.Event()
+        self._delivers = False
+        self._seq = self._queued = 0
+        # A daemon thread: a driver that never returns must not keep the process alive.
+        self._thread = threading.Thread(target=self._run, name="gripmon-camera", daemon=True)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        return self._delivers and not self._newest.ended
 
     @property
     def dropped(self) -> int:
-        return super().dropped + self._camera.queued
+        return self._newest.dropped + self._queued
 
+    def read(self) -> Frame | Waiting | None:
+        frame = self._newest.take(READ_TIMEOUT_S)
+        if frame is not None or self._stop.is_set():
+            return frame
+        if self._fault is not None:
+            raise self._fault
+        return Waiting(self._waiting)
 
-class Backoff:
-    """Pauses that double from the first to the longest; call :meth:`reset` after a success."""
+    def close(self) -> None:
+        self._stop.set()
+        self._newest.end(discard=True)
+        if self._thread is not threading.current_thread():
+            self._thread.join(self._close_within_s)
+            if self._thread.is_alive():
+                _log.warning("the camera driver has not returned after %.1f s; left behind", self._close_within_s)
 
-    def __init__(self, first_s: float, longest_s: float) -> None:
-        self._first_s, self._longest_s = first_s, longest_s
-        self._next_s = first_s
+    def _run(self) -> None:
+        settings = self._settings
+        pause_s = settings.retry_first_s
+        try:
+            while not self._stop.is_set():
+                stream, wrong, before = self._connect(), "can't be opened", self._seq
+                if stream is not None:
+                    wrong = self._deliver(stream)
+                if self._seq > before:
+                    pause_s = settings.retry_first_s
+                if not self._stop.is_set():
+                    pause_s = min(pause_s, settings.retry_longest_s)
+                    self._waiting = f"{self._name} {wrong}; next attempt after {pause_s:g} s"
+                    _log.warning("%s", self._waiting)
+                    self._stop.wait(pause_s)
+                    pause_s *= 2.0
+        except BaseException as error:  # noqa: BLE001  not handled here: the consumer raises it
+            self._fault = error
+        finally:
+            self._newest.end()
 
-    def next_s(self) -> float:
-        pause_s = min(self._next_s, self._longest_s)
-        self._next_s = 2.0 * pause_s
-        return pause_s
+    def _connect(self) -> _Stream | None:
+        settings = self._settings
+        stream: _Stream | None = None
+        if is_http(settings):
+            from gripmon.io.sources.http_jpegs import HttpJpegs  # http and ssl: 0.02 s
 
-    def reset(self) -> None:
-        self._next_s = self._first_s
+            try:
+                stream = HttpJpegs.open(str(settings.device), settings.open_timeout_s, settings.read_timeout_s)
+            except OSError as error:
+                _log.debug("%s: %s", self._name, error)
+                return None
+        return stream or _VideoCapture.open(settings, self._api, self._name)
+
+    def _deliver(self, stream: _Stream) -> str:
+        """Hand over frames while they come; what is wrong then."""
+        backlog = Backlog()
+        try:
+            while not self._stop.is_set() and stream.grab():
+                stamp_ns, arrived_ns, seq = time.time_ns(), time.monotonic_ns(), self._seq
+                self._seq += 1
+                if backlog.queued(1e-9 * stamp_ns):  # not by the monotonic clock, which stands still in suspend
+                    self._queued += 1
+                    self._waiting = f"{self._name}: old frames that queued up are passed over"
+                    continue
+                image, fault = stream.image()
+                if not self._delivers:
+                    self._delivers = True
+                    _log.info("%s: connected", self._name)
+                self._newest.put(Frame(seq, stamp_ns, image, None, self._name, fault, arrived_ns=arrived_ns))
+                self._waiting = "the camera is silent"
+            return "delivers no frames" if self._delivers else "opens, but delivers no frame"
+        finally:
+            self._delivers = False
+            stream.release()
 
 
 class _Stream(Protocol):
@@ -146,87 +221,6 @@ def _ask_for_options(capture: Any, settings: LiveSettings, name: str) -> None:
     for key, (prop, value) in asked.items():
         if value is not None and abs(capture.get(prop) - value) > 0.01 * value:
             _log.warning("%s: %s is %g, not the %g asked for", name, key, capture.get(prop), value)
-
-
-class _CaptureReader:
-    """The blocking part: opens, reads, and opens again after a pause."""
-
-    def __init__(self, settings: LiveSettings) -> None:
-        self._settings = settings
-        self._name = shown_name(settings.device)
-        self._api = backend_number(settings)
-        self._backoff = Backoff(settings.retry_first_s, settings.retry_longest_s)
-        self._capture: _Stream | None = None
-        self._stop = threading.Event()
-        self._next_try_s = 0.0
-        self._waiting = Waiting(f"{self._name}: connecting")
-        self._seq = 0
-        self.queued = 0
-        """Frames that were dropped because they had queued up."""
-        self._backlog = Backlog()
-        self._delivers = False
-
-    @property
-    def connected(self) -> bool:
-        return self._delivers
-
-    def interrupt(self) -> None:
-        self._stop.set()
-
-    def close(self) -> None:
-        self._release()
-
-    def read(self) -> Frame | Waiting:
-        if self._capture is None:
-            pause_s = self._next_try_s - time.monotonic()
-            if pause_s > 0.0:
-                self._stop.wait(min(pause_s, _PAUSE_S))
-                return self._waiting
-            self._capture = self._connect()
-            if self._capture is None:
-                return self._lost("can't be opened")
-            self._backlog = Backlog()
-        if not self._capture.grab():
-            return self._lost("delivers no frames" if self._delivers else "opens, but delivers no frame")
-        stamp_ns, arrived_ns = time.time_ns(), time.monotonic_ns()
-        if self._backlog.queued(1e-9 * stamp_ns):  # not by the monotonic clock, which stands still in suspend
-            self._seq += 1
-            self.queued += 1
-            return Waiting(f"{self._name}: old frames that queued up are passed over")
-        image, fault = self._capture.image()
-        if not self._delivers:
-            self._delivers = True
-            _log.info("%s: connected", self._name)
-        self._backoff.reset()
-        seq, self._seq = self._seq, self._seq + 1
-        return Frame(seq, stamp_ns, image, None, self._name, fault, arrived_ns=arrived_ns)
-
-    def _connect(self) -> _Stream | None:
-        settings = self._settings
-        stream: _Stream | None = None
-        if is_http(settings):
-            from gripmon.io.sources.http_jpegs import HttpJpegs  # http and ssl: 0.02 s
-
-            try:
-                stream = HttpJpegs.open(str(settings.device), settings.open_timeout_s, settings.read_timeout_s)
-            except OSError as error:
-                _log.debug("%s: %s", self._name, error)
-                return None
-        return stream or _VideoCapture.open(settings, self._api, self._name)
-
-    def _lost(self, what: str) -> Waiting:
-        self._release()
-        pause_s = self._backoff.next_s()
-        self._next_try_s = time.monotonic() + pause_s
-        self._waiting = Waiting(f"{self._name} {what}; next attempt after {pause_s:g} s")
-        _log.warning("%s", self._waiting.reason)
-        return self._waiting
-
-    def _release(self) -> None:
-        self._delivers = False
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
 
 
 def is_http(settings: LiveSettings) -> bool:
