@@ -12,10 +12,10 @@ import zenoh
 from support.loopback import WAIT_S, ask, frame_record, free_endpoint, plain_session, wait_until
 from support.published import Published
 
-from gripmon.io.publish.commands import PendingCommand
+from gripmon.io.publish.commands import PendingCommand, _reply
 from gripmon.io.publish.presence import _WAITING_MOST, Answers
 from gripmon.io.wire import PublishSettings
-from gripmon.model.records import Command, CommandName, CommandReply
+from gripmon.model.records import Command, CommandError, CommandName, CommandReply
 
 
 class StalledQuery:
@@ -53,8 +53,12 @@ REPLY = CommandReply(CommandName.UNDO, True, "so be it", "plate-2", 4)
 def test_the_loop_does_not_wait_for_an_asker_that_does_not_read(stalled: StalledQuery):
     """If it did, this test would end only with the link: the reply comes back when the test lets it."""
     answers = Answers("test")
-    pending = PendingCommand(Command(CommandName.UNDO), 1000.0, answers)
-    assert pending.join(stalled, stalled.key_expr) and pending.take()  # type: ignore[arg-type]
+    pending = PendingCommand(Command(CommandName.UNDO), 1000.0)
+
+    def tell(answer: CommandReply | CommandError, _attachment: bytes | None) -> None:
+        answers.send(stalled, _reply("a/key", answer, ""))  # type: ignore[arg-type]
+
+    assert pending.wait(tell) and pending.take()
     pending.answer(REPLY)
     assert stalled.begun.wait(WAIT_S) and not stalled.given_up.is_set() and not stalled.payloads
     stalled.given_up.set()

@@ -19,10 +19,11 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import to_settings
+from gripmon.io.publish.commands import PendingCommand
 from gripmon.io.ros2 import output as output_module
 from gripmon.io.ros2.diagnostics import ERROR, OK, STALE, WARN, level_of, summary_of, values_of
 from gripmon.io.ros2.node import Ros2Missing, check_rclpy, domain_of
-from gripmon.io.ros2.output import Ros2Output, RosCommand, inverse
+from gripmon.io.ros2.output import Ros2Output, inverse
 from gripmon.io.ros2.settings import Ros2Settings, as_token
 from gripmon.io.sources.payload import PayloadError, message_image
 from gripmon.model.geometry import from_record, invert, make_transform, to_record
@@ -181,9 +182,9 @@ def asked(output: Ros2Output, name: CommandName) -> tuple[threading.Thread, Simp
     return thread, response
 
 
-def next_of(output: Ros2Output) -> RosCommand:
+def next_of(output: Ros2Output) -> PendingCommand:
     """The next command, once it has come."""
-    found: list[RosCommand | None] = []
+    found: list[PendingCommand | None] = []
     wait_until(lambda: found.append(output.poll()) or found[-1], "a command")
     assert found[-1] is not None
     return found[-1]
@@ -210,7 +211,7 @@ def test_what_nobody_waits_for_any_more_is_not_carried_out(output: Ros2Output, m
     caller, response = asked(output, CommandName.UNDO)
     taken = next_of(output)
     caller.join()
-    assert response.message.endswith("it may still be carried out")
+    assert response.message.endswith("it may still be carried out, ask for the state")
     taken.answer(CommandReply(CommandName.UNDO, True, "late", "plate-2", 4))
 
 
@@ -221,7 +222,7 @@ def test_two_monitors_of_a_name_and_one_that_stops_carry_out_nothing(output: Ros
     assert "0af3" in response.message and not response.success and output.poll() is None
     output.twins = []
     caller, response = asked(output, CommandName.RESET)
-    wait_until(lambda: output._asked, "the command")
+    wait_until(lambda: output._asked._waiting, "the command")
     output.close()  # one that waits already, and one that comes later
     caller.join()
     later, response_later = asked(output, CommandName.RESET)

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from concurrent.futures import Future
 
 import msgspec
 import zenoh
@@ -39,65 +40,94 @@ _QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
 _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
 
 
-class PendingCommand:
-    """A command and all queries that wait for its answer; a sender may repeat a command under the same id.
+Tell = Callable[[CommandReply | CommandError, bytes | None], None]
+"""Takes an answer and its attachment to who asked, once."""
 
-    It is executed at most once.  Each query gets one reply: the answer, or an error at the timeout.
+
+class PendingCommand:
+    """A command, and those that wait for its answer; several may, of one sender that repeats it under the same id.
+
+    It is executed at most once.  Each of them is told once: the answer, or an error after ``timeout_s``.
     """
 
-    def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
-        """``monitor_id``: the id of the monitor that answers."""
-        self.command, self._monitor_id = command, monitor_id
-        self._answers = answers
-        self._timeout_s = timeout_s
-        self._lock = threading.Lock()  # guards what follows
-        self._askers: list[_Asker] = []
-        self._answer: CommandReply | CommandError | None = None
-        self._taken = self._dropped = False
+    def __init__(self, command: Command, timeout_s: float) -> None:
+        self.command, self._timeout_s = command, timeout_s
+        self._answered: Future[tuple[CommandReply | CommandError, bytes | None]] = Future()
+        self._lock = threading.Lock()  # guards the number against the end of the last one's time
+        self.askers = 0
 
-    @property
-    def askers(self) -> int:
-        """Number of queries that wait for the answer."""
-        return len(self._askers)
+    def wait(self, tell: Tell) -> bool:
+        """Have the answer told; False if the command was given up without execution."""
+        told = threading.Lock()  # by the first who takes it
 
-    def join(self, query: zenoh.Query, key: str) -> bool:
-        """Add a waiting query, or reply if the answer is known; False if the command was given up without execution."""
+        def answered(future: Future[tuple[CommandReply | CommandError, bytes | None]]) -> None:
+            if not future.cancelled() and told.acquire(blocking=False):
+                timer.cancel()
+                with self._lock:
+                    self.askers -= 1
+                tell(*future.result())
+
+        def time_is_over() -> None:
+            if told.acquire(blocking=False):
+                with self._lock:
+                    self.askers -= 1
+                    given_up = self.askers == 0 and self._answered.cancel()
+                became = "it is not carried out" if given_up else "it may still be carried out, ask for the state"
+                text = f"the monitor has not answered within {self._timeout_s:g} s; {became}"
+                tell(CommandError(CommandFault.TIMEOUT, text), None)
+
         with self._lock:
-            if self._dropped:
+            if self._answered.cancelled():
                 return False
-            answer = self._answer
-            if answer is None:
-                self._askers.append(asker := _Asker(query, key, self._answers, self._monitor_id))
-        if answer is not None:
-            self._answers.send(query, _reply(key, answer, self._monitor_id))
-        else:
-            asker.wait(self._timeout_s, lambda: self._time_is_over(asker))
+            self.askers += 1
+        timer = threading.Timer(self._timeout_s, time_is_over)
+        timer.daemon = True
+        timer.start()
+        self._answered.add_done_callback(answered)
         return True
 
     def take(self) -> bool:
-        """Claim the command for execution by the loop; False if all its queries already got a timeout."""
-        with self._lock:
-            self._taken = bool(self._askers)
-            self._dropped = not self._taken
-            return self._taken
+        """Claim the command for execution by the loop; False if nobody waits for it any more."""
+        return self._answered.set_running_or_notify_cancel()
 
     def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
-        """Reply to the waiting queries and to later repeats; immediate, but with an attachment it may take seconds."""
-        with self._lock:
-            self._answer = answer
-            askers, self._askers = self._askers, []
-        for asker in askers:
-            asker.tell(answer, attachment)
+        """Tell those who wait, and later repeats; immediate, but with an attachment it may take seconds."""
+        self._answered.set_result((answer, attachment))
 
-    def _time_is_over(self, asker: _Asker) -> None:
+
+class CommandQueue:
+    """Commands that wait for the loop, at most :data:`WAITING_MOST`."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[PendingCommand] = deque()
+        self._lock = threading.Lock()  # one that comes while it is being closed is refused, or answered
+        self._closed = False
+
+    def put(self, pending: PendingCommand, tell: Tell) -> CommandError | None:
+        """Add a command whose answer is told, or return why not."""
         with self._lock:
-            if asker not in self._askers:
-                return
-            self._askers.remove(asker)
-            lives = self._taken or bool(self._askers)
-            became = "it may still be carried out, ask for the state" if lives else "it is not carried out"
-        text = f"the monitor has not answered within {self._timeout_s:g} s; {became}"
-        asker.tell(CommandError(CommandFault.TIMEOUT, text))
+            if self._closed:
+                return _STOPPING
+            if len(self._waiting) >= WAITING_MOST:
+                return CommandError(CommandFault.BUSY, f"{WAITING_MOST} commands wait already; try again later")
+            pending.wait(tell)
+            self._waiting.append(pending)
+        return None
+
+    def poll(self) -> PendingCommand | None:
+        """The next command to execute and answer, without waiting; None if there is none."""
+        while self._waiting:
+            pending = self._waiting.popleft()
+            if pending.take():
+                return pending
+        return None
+
+    def close(self) -> None:
+        """Tell all who wait, and all who come, that the monitor is stopping."""
+        with self._lock:
+            self._closed = True
+        while (pending := self.poll()) is not None:
+            pending.answer(_STOPPING)
 
 
 class ZenohCommands:
@@ -114,11 +144,11 @@ class ZenohCommands:
         self._keys, self._presence = keys, presence
         self._malformed = Malformed("command", keys["cmd"])
         self._timeout_s = timeout_s
-        self._waiting: deque[PendingCommand] = deque()
+        self._queue = CommandQueue()
+        self.poll = self._queue.poll
         self._lock = threading.Lock()  # guards the commands by id
         self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
-        self._closed = False
         flooded = CommandError(CommandFault.BUSY, "too many requests wait already; try again later")
         self._answers = Answers("commands", _reply("", flooded, self._monitor_id))
         link.attach(self._attach, self.close)
@@ -128,20 +158,9 @@ class ZenohCommands:
         """Number of requests so far with a malformed payload."""
         return self._malformed.count
 
-    def poll(self) -> PendingCommand | None:
-        """Return the next command to execute and answer, without waiting; None if there is none."""
-        while self._waiting:
-            pending = self._waiting.popleft()
-            if pending.take():
-                return pending
-        return None
-
     def close(self) -> None:
         """Tell the waiting queries that the monitor is stopping."""
-        with self._lock:  # a command being received right now is answered below, too
-            self._closed = True
-        while (pending := self.poll()) is not None:
-            pending.answer(_STOPPING)
+        self._queue.close()
         self._answers.close()
 
     def _attach(self, session: zenoh.Session) -> None:
@@ -152,14 +171,14 @@ class ZenohCommands:
         # Zenoh swallows an exception here and the client would get an empty result: always send an error reply.
         key = str(query.key_expr)
         try:
-            error = self._queue(query, key)
+            error = self._ask(query, key)
         except Exception as fault:  # noqa: BLE001  see above
             _log.debug("command on %s", key, exc_info=fault)
             error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
         if error is not None:
             self._answers.send(query, _reply(key, error, self._monitor_id))
 
-    def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
+    def _ask(self, query: zenoh.Query, key: str) -> CommandError | None:
         """Queue the command for the loop; returns an error if it can't be queued."""
         name = _name(self._keys, key)
         if isinstance(name, CommandError):
@@ -170,25 +189,29 @@ class ZenohCommands:
             return request
         if wrong := self._meant_for_another(request):
             return wrong
+
+        def tell(answer: CommandReply | CommandError, attachment: bytes | None) -> None:
+            reply = _reply(key, answer, self._monitor_id, attachment)
+            if attachment is None:
+                self._answers.send(query, reply)
+            else:  # large: its producer has a thread for sending, and makes no other answer meanwhile
+                send_now(query, reply)
+
         command = Command(name, request.argument)
         with self._lock:
-            if self._closed:
-                return _STOPPING
             known = self._known.get(request.id)
             if known is not None and known.command != command:
                 text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
                 return CommandError(CommandFault.ID_REUSED, text)
             if known is not None and known.askers >= WAITING_MOST:  # each occupies a thread until its timeout
                 return CommandError(CommandFault.BUSY, f"{WAITING_MOST} wait for this answer already; try again later")
-            if known is not None and known.join(query, key):
+            if known is not None and known.wait(tell):
                 return None
-            if len(self._waiting) >= WAITING_MOST:
-                return CommandError(CommandFault.BUSY, f"{WAITING_MOST} commands wait already; try again later")
-            pending = PendingCommand(command, self._timeout_s, self._answers, self._monitor_id)
-            pending.join(query, key)
-            self._remember(request.id, pending)
-            self._waiting.append(pending)
-        return None
+            pending = PendingCommand(command, self._timeout_s)
+            error = self._queue.put(pending, tell)
+            if error is None:
+                self._remember(request.id, pending)
+            return error
 
     @property
     def _monitor_id(self) -> str:
@@ -211,28 +234,6 @@ class ZenohCommands:
             self._known.move_to_end(request_id)
             if len(self._known) > _REMEMBERED_MOST:
                 self._known.popitem(last=False)
-
-
-class _Asker:
-    """One query waiting for its answer."""
-
-    def __init__(self, query: zenoh.Query, key: str, answers: Answers, monitor_id: str) -> None:
-        self._query, self._key, self._answers, self._monitor_id = query, key, answers, monitor_id
-        self._timer: threading.Timer | None = None
-
-    def wait(self, timeout_s: float, is_over: Callable[[], None]) -> None:
-        self._timer = threading.Timer(timeout_s, is_over)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def tell(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        reply = _reply(self._key, answer, self._monitor_id, attachment)
-        if attachment is None:
-            self._answers.send(self._query, reply)
-        else:  # large: its producer has a thread for sending, and makes no other answer meanwhile
-            send_now(self._query, reply)
 
 
 def _name(keys: Keys, key: str) -> CommandName | CommandError:

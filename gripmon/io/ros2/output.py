@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.io.publish.commands import TIMEOUT_S, WAITING_MOST
+from gripmon.io.publish.commands import TIMEOUT_S, CommandQueue, PendingCommand
 from gripmon.io.publish.presence import in_words
 from gripmon.io.ros2.diagnostics import level_of, summary_of, values_of
 from gripmon.io.ros2.node import RosNode
@@ -27,7 +27,6 @@ from gripmon.model.records import (
     Cause,
     Command,
     CommandError,
-    CommandFault,
     CommandName,
     CommandReply,
     Frame,
@@ -50,7 +49,6 @@ than twice the controller client's default for the age, so that a busy machine s
 
 _MOST_RECORDS = 16  # that wait for the middleware; then the oldest are dropped
 _CLOSE_S = 1.0
-_STOPPING = "the monitor stops; the command is not carried out"
 
 
 def inverse(cam_T_grip: Transform, covariance: Sequence[float]) -> tuple[Transform, Array]:
@@ -61,18 +59,6 @@ def inverse(cam_T_grip: Transform, covariance: Sequence[float]) -> tuple[Transfo
     jacobian = inverse_jacobian(transform)
     matrix = np.fromiter(covariance, float, 36).reshape(6, 6)
     return to_record(invert(transform)), (jacobian @ matrix @ jacobian.T).ravel()
-
-
-class RosCommand:
-    """A command that a service's caller waits for."""
-
-    def __init__(self, name: CommandName) -> None:
-        self.command = Command(name)
-        self.answered: Future[CommandReply | CommandError] = Future()
-
-    def answer(self, answer: CommandReply | CommandError, _attachment: bytes | None = None) -> None:
-        """Answer the caller, if it still waits."""
-        self.answered.set_result(answer)
 
 
 class Ros2Output(Output):
@@ -103,7 +89,8 @@ class Ros2Output(Output):
         self._commands, self._others = commands, others
         self._waiting: deque[tuple[float, FrameRecord | StateRecord | AlertRecord]] = deque(maxlen=_MOST_RECORDS)
         self._some, self._closed = threading.Event(), False
-        self._asked: deque[RosCommand] = deque()
+        self._asked = CommandQueue()
+        self.poll = self._asked.poll
         self._topics: tuple[Any, Any, Any] | None = None
         self._frame: FrameRecord | None = None  # the newest; this and what follows is the publishing thread's
         self._waited_s = 0.0
@@ -129,20 +116,11 @@ class Ros2Output(Output):
         """Why ROS has nothing of this at present, in a few words for a person; empty if it has."""
         return self._node.fault()
 
-    def poll(self) -> RosCommand | None:
-        """The next command to carry out and answer, without waiting; None if there is none."""
-        while self._asked:
-            asked = self._asked.popleft()
-            if asked.answered.set_running_or_notify_cancel():
-                return asked
-        return None
-
     def close(self) -> None:
         """Leave the graph; what waits is dropped, commands are refused.  Calling it twice does nothing more."""
         self._closed = True
         self._some.set()
-        while (asked := self.poll()) is not None:
-            asked.answer(CommandError(CommandFault.STOPPING, _STOPPING))
+        self._asked.close()
         self._thread.join(_CLOSE_S)
         self._node.close()
 
@@ -166,20 +144,16 @@ class Ros2Output(Output):
 
     def _serve(self, name: CommandName, _request: Any, response: Any) -> Any:
         """Have the loop carry out a command, in the node's thread."""
-        asked = RosCommand(name)
+        told: Future[CommandReply | CommandError] = Future()
+        pending = PendingCommand(Command(name), TIMEOUT_S)
         if others := self._others():
             response.message = f"{in_words(others)}; stop it or this one first"
-        elif self._closed or len(self._asked) >= WAITING_MOST:
-            response.message = _STOPPING if self._closed else "too many commands wait already; try again later"
+        elif error := self._asked.put(pending, lambda answer, _: told.set_result(answer)):
+            response.message = error.text
         else:
-            self._asked.append(asked)
-            try:
-                answer = asked.answered.result(TIMEOUT_S)
-                response.success = isinstance(answer, CommandReply) and answer.done
-                response.message = answer.text
-            except TimeoutError:
-                became = "it is not carried out" if asked.answered.cancel() else "it may still be carried out"
-                response.message = f"the monitor has not answered within {TIMEOUT_S:g} s; {became}"
+            answer = told.result()
+            response.success = isinstance(answer, CommandReply) and answer.done
+            response.message = answer.text
         return response
 
     def _publish(self) -> None:
