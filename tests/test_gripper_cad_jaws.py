@@ -77,6 +77,7 @@ def test_sibling_jaws_are_a_pair_however_the_urdf_mirrors_them(tmp_path: Path, h
     assert made.gripper.finger_ids == ("left", "right") and made.origins == ("left", "right")
     assert (made.gripper.jaw_min_m, made.gripper.jaw_max_m) == pytest.approx((0.004, 0.100), abs=1e-6)
     assert says(made, "z points along +z of the CAD frame, x along +x, from finger left to right")
+    assert says(made, "between the fingertips is (0, 0, 0.05) m of the CAD frame: the TCP")
     for opening_m in (0.004, 0.052, 0.100):
         assert inner_sides_m(made, opening_m) == pytest.approx([-opening_m / 2, opening_m / 2], abs=1e-6)
     assert says(made, "joint 'b' opens the jaws together with 'a'") == (chosen == "a" and how != "mimic")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from support.changing_backgrounds import images_of, moving_robot
+from support.meters import box_gripper
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 import gripmon
@@ -20,10 +21,16 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.daemon.promised import images_of as images_to_judge
 from gripmon.daemon.promised import picture_of
+from gripmon.model.camera import make_camera
 from gripmon.model.geometry import to_record
-from gripmon.model.records import NOTHING_WRONG, ValidBy, Verdict
+from gripmon.model.poses import perturb
+from gripmon.model.records import NOTHING_WRONG, ReferenceRecord, ValidBy, Verdict
+from gripmon.monitor import MonitorSettings
+from gripmon.monitor.weigher import Weigher
 from gripmon.teach.drawing import Canvas
-from gripmon.teach.kept import Kept, Sizes
+from gripmon.teach.kept import Kept, Sizes, as_frames, kept, with_help
+from gripmon.teach.views import TeachingImage
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges.words import in_words
 
 REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "real"
@@ -203,3 +210,17 @@ def test_a_picture_shows_fingers_of_thirty_pixels_large_and_never_leaves_the_ima
     assert small.picture[v, u].min() > 200
     whole = Canvas.about(image, np.array([[100.0, 50.0], [1200.0, 700.0]]), 1200)
     assert whole.zoom == 1 and whole.picture.shape == (720, 1280, 3)
+
+
+def test_a_gripper_that_is_not_at_the_reference_is_said_with_its_distance():
+    """Nine millimetres beside a reference that is stated to be good to one: more edges wouldn't help."""
+    rig = Rig(make_camera(PAPER_LENS), box_gripper(), MonitorSettings())
+    off = perturb(nominal_cam_T_grip(), np.array([0.0, 0.0, 9e-3, 0.0, 0.0, 0.0]))
+    covariance = tuple(np.diag([1e-6] * 3 + [1e-6] * 3).ravel().tolist())
+    reference = ReferenceRecord("off", 0, 0, "configuration", to_record(off), covariance)
+    images = images_of(moving_robot(4))[:3]
+    frames = as_frames([TeachingImage(image, OPENING_M, f"{k}") for k, image in enumerate(images)])
+    found = kept(rig, reference, frames)
+    assert found.away_m == pytest.approx(9e-3, abs=3e-4) and found.away_rad == pytest.approx(0.0, abs=5e-3)
+    helped = with_help(msgspec.structs.replace(found, hypothesis=Weigher.not_as_expected), rig, lambda _: found)
+    assert helped.help().startswith("what helps most: the gripper appears 9")

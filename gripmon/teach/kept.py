@@ -15,9 +15,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import NOTHING_WRONG, Array, Frame, ReferenceRecord, ValidBy, Verdict
+from gripmon.model.geometry import from_record
+from gripmon.model.poses import perturbation_between
+from gripmon.model.records import (
+    NOTHING_WRONG,
+    Absolute,
+    Array,
+    Frame,
+    ReferenceRecord,
+    Transform,
+    ValidBy,
+    Verdict,
+)
 from gripmon.model.units import in_degrees, in_mm
 from gripmon.monitor import Monitor
+from gripmon.monitor.weigher import Weigher
 from gripmon.teach.accuracy import Accuracy, as_if_measured, forecast_frame
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig
@@ -69,7 +81,8 @@ class Kept(msgspec.Struct, frozen=True):
     ``valid_by`` names the one that a verdict goes by.
 
     ``hypothesis``: what it can't be excluded most often, that makes this bound as large, and in how many images;
-    ``reason``: why most of those that weren't measured weren't.  ``helps``: what would help most, and the median that
+    ``reason``: why most of those that weren't measured weren't.  ``away_m`` and ``away_rad``: how far from the reference
+    the images show the gripper, in the median; None where none was measured.  ``helps``: what would help most, and the median that
     the bound has with it, None where that wasn't computed.
 
     ``forecast``: of no image, but of a frame that measures all edges in view, before the usual clutter.
@@ -87,6 +100,8 @@ class Kept(msgspec.Struct, frozen=True):
     reason: str | None
     alert_limit_m: float
     alert_limit_rad: float
+    away_m: float | None = None
+    away_rad: float | None = None
     helps: str | None = None
     helped_m: float | None = None
     helped_rad: float | None = None
@@ -233,6 +248,8 @@ def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
     for bounds in (since, absolute):  # what a frame's reason calls undetermined
         bounds[(bounds > (VAGUE_M, VAGUE_RAD)).any(axis=1)] = np.inf
     measured = [record for record in counted if record.measured]
+    away = [_away(record.absolute, reference) for record in measured if record.absolute is not None]
+    away_m, away_rad = np.median(away, axis=0).tolist() if away else (None, None)
     named = Counter(r.protection.hypothesis for r in measured if r.protection is not None)
     hypothesis, often = named.most_common(1)[0] if named else ("", 0)
     unseen = Counter(r.reason for r in counted if not r.measured and r.reason)
@@ -249,7 +266,16 @@ def kept(rig: Rig, reference: ReferenceRecord, frames: Iterable[Frame]) -> Kept:
         reason=unseen.most_common(1)[0][0] if unseen else None,
         alert_limit_m=policy.alert_limit_m,
         alert_limit_rad=policy.alert_limit_rad,
+        away_m=away_m,
+        away_rad=away_rad,
     )
+
+
+def _away(seen: Absolute, reference: ReferenceRecord) -> tuple[float, float]:
+    """How far (m, rad) the TCP as measured is from the reference."""
+    measured_T = from_record(Transform(seen.translation_m, seen.rotation_xyzw))
+    way = perturbation_between(from_record(reference.cam_T_grip), measured_T)
+    return float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:]))
 
 
 def foreseen(accuracy: Accuracy, rig: Rig) -> Kept:
@@ -296,13 +322,17 @@ def with_help(found: Kept, rig: Rig, again: Callable[[Rig], Kept]) -> Kept:
         if best.median_excess < LEAST_HELP * found.median_excess:
             sizes = best.sizes
             return msgspec.structs.replace(found, helps=words, helped_m=sizes.median_m, helped_rad=sizes.median_rad)
-    return msgspec.structs.replace(found, helps=_asked_for(found.hypothesis))
+    return msgspec.structs.replace(found, helps=_asked_for(found))
 
 
-def _asked_for(hypothesis: str) -> str | None:
-    """What would exclude a hypothesis."""
+def _asked_for(found: Kept) -> str | None:
+    """What would exclude the hypothesis that makes a bound as large."""
+    hypothesis = found.hypothesis
     if not hypothesis:
         return None
+    if hypothesis.startswith(Weigher.not_as_expected) and found.away_m is not None:
+        seen = f"the gripper appears {_said(found.away_m, found.away_rad)} from the reference"
+        return f"{seen}: calibrate again, correct the gripper file, or take the pose that gripmon teach prints"
     if hypothesis == NOTHING_WRONG:
         return "more of the fingers in the picture, nearer and in focus"
     if "grasped" in hypothesis:

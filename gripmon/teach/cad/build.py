@@ -180,6 +180,8 @@ def _frame(parts: Parts, approach: str | None) -> tuple[Array, list[str]]:
     transform, corners = frame_of(fingers, axes)
     way = f", from finger {' to '.join(list(parts.fingers)[:: len(fingers) - 1])}" if len(fingers) > 1 else ""
     notes = [f"z points along {_axis(axes[2])} of the CAD frame, x along {_axis(axes[0])}{way}"]
+    x, y, z = (0.0 + round(v, 5) for v in (-transform[:3, :3].T @ transform[:3, 3]).tolist())
+    notes.append(f"between the fingertips is ({x:g}, {y:g}, {z:g}) m of the CAD frame: the TCP, unless --frame cad")
     if not all(corners):
         notes.append("a fingertip has no sharp corners: the TCP is between the tips' innermost points")
     return transform, notes
