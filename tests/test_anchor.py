@@ -90,7 +90,7 @@ def averaged(frames: list[Frame], creep: np.ndarray = STILL) -> Anchor:
 
 def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray = STILL) -> float:
     cases, _ = anchor.cases(frame.cam_T_grip, frame, ROWS, wander, LASTING.priors(SURE))
-    return NOTHING_COMMON.absolute(cases, frame.cam_T_grip).levels(risk)[0]
+    return NOTHING_COMMON.absolute([cases], frame.cam_T_grip).levels(risk)[0]
 
 
 def error_m(frame: Frame, truth: np.ndarray = STILL) -> float:

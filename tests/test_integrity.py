@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from support.by_numpy.integrity import beyond
 
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
+from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
 from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
 from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails
 
@@ -198,7 +198,7 @@ def doubts_of(prior: list[float], away: list[float], sigma: list[float]) -> Doub
     shift[:, 0], covariance[:, 0, 0] = away, np.square(sigma)
     covariance[:, range(3, 6), range(3, 6)] = 9.0
     fits = Separation(shift, covariance, exact_model(len(prior)))
-    return Doubts.of(tuple(str(k) for k in range(len(prior))), np.array(prior), fits, 1.0)
+    return Doubts((Cases.of(tuple(str(k) for k in range(len(prior))), np.array(prior), fits),), 1.0)
 
 
 def test_one_hypothesis_takes_all_of_the_risk():
@@ -243,16 +243,16 @@ def test_levels_take_position_and_rotation_alone():
     covariance[:, 0, 3] = covariance[:, 3, 0] = 1.0  # errors that belong together change neither part
     shift = np.array([[3.0, 0.0, 4.0, 0.0, -2.0, 0.0]])
     fits = Separation(shift, covariance, exact_model(1))
-    position, rotation, _ = Doubts.of(("one",), np.ones(1), fits, 1.5).levels(1e-3)
+    position, rotation, _ = Doubts((Cases.of(("one",), np.ones(1), fits),), 1.5).levels(1e-3)
     assert position == pytest.approx(5.0 + 1.5 * 2.0 * stats.chi2.isf(1e-3, 1) ** 0.5, rel=0.025)
     assert rotation == pytest.approx(2.0 + 1.5 * 3.0 * stats.chi2.isf(1e-3, 3) ** 0.5, rel=0.025)
 
 
-def test_doubts_add_up_and_are_chosen_from():
+def test_doubts_of_several_sets_are_those_of_one():
     one, other = doubts_of([1.0, 0.1], [0.0, 2.0], [1.0, 1.0]), doubts_of([0.2], [9.0], [1.0])
     at_once = doubts_of([1.0, 0.1, 0.2], [0.0, 2.0, 9.0], [1.0] * 3)
-    assert (one + other).levels(1e-3)[:2] == at_once.levels(1e-3)[:2]
-    assert (one + other).among(np.array([True, True, False])).levels(1e-3) == one.levels(1e-3)
+    *both, name = Doubts((*one.sets, *other.sets), 1.0).levels(1e-3)
+    assert tuple(both) == at_once.levels(1e-3)[:2] and name == "0"  # the other's own
 
 
 # --- the promise ---
@@ -273,7 +273,7 @@ def of_two_fingers(has_opening: bool = False) -> Hypotheses:
 def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
     """The bound of the position: the first fit is published."""
     found = found._replace(shift=found.shift - found.shift[0])
-    return Doubts.of(hypotheses.name, hypotheses.prior, found, 1.0).levels(risk)[0]
+    return Doubts((Cases.of(hypotheses.name, hypotheses.prior, found),), 1.0).levels(risk)[0]
 
 
 def exceeded(model: Model, hypotheses: Hypotheses, risk: float, trials: int, bias: np.ndarray, seed: int) -> float:

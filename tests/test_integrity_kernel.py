@@ -9,15 +9,17 @@ import pytest
 from support.by_numpy import integrity as by_numpy
 
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.model.geometry import perturb, skew
 from gripmon.model.records import FrameRecord
 from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.track.integrity import Doubts, Separation, kernel, separation
+from gripmon.track.integrity import Cases, Doubts, Separation, kernel, level_kernel, separation
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
 HYPOTHESES, EDGES, FINGERS = 14, 8, 2
+AT_T = perturb(np.eye(4), np.array([0.01, -0.02, 0.2, 0.1, 0.2, -0.1]))
 
 
 def covariances(rng: np.random.Generator, count: int, m: int = 6) -> np.ndarray:
@@ -90,9 +92,6 @@ def test_averages_are_those_of_numpy(seed: int):
     agree(kernel.follow(*average, *frame, wander), by_numpy.follow(*average, *frame, wander))
     known = at, covariances(rng, 1)[0]
     agree(kernel.with_known(*frame, *known), by_numpy.with_known(*frame, *known))
-    which, (lever, turn) = rng.integers(0, HYPOTHESES, HYPOTHESES), rng.normal(size=(2, 6, 6))
-    of = *frame, which, *average, lever * SIZE[:6, None] / SIZE[:6], turn * SIZE[:6, None] / SIZE[:6], known[1]
-    agree(kernel.of_motion(*of), by_numpy.of_motion(*of))
     rows = rng.integers(-1, HYPOTHESES, HYPOTHESES)
     told = by_numpy.telling(*average, at, wander, *frame, rows, 12.0)
     agree(kernel.telling(*average, at, wander, *frame, rows, 12.0), told)
@@ -100,6 +99,55 @@ def test_averages_are_those_of_numpy(seed: int):
     assert 0 < by_frame.sum() < HYPOTHESES and not by_frame[rows < 0].any()
     of = frame.shift, at, frame.covariance, frame.of_model, 1.44, covariances(rng, 1)[0], average.of_model[0]
     agree((kernel.squares(*of),), (by_numpy.squares(*of),))
+
+
+@pytest.mark.parametrize("m", [6, 7])
+def test_a_frames_refits_are_those_of_numpy(m: int):
+    rng = np.random.default_rng(3)
+    pull, information, middle, model, _, _, keep, *_ = normal_equations(rng, m)
+    xi, edge = np.append(shifts(rng, 1)[0], [1e-4] * (m - 6)), np.array([0, 1, 3, 4, 5, 6, 8, 9])
+    normal = pull, information, middle, model[0], edge
+    gripper = np.repeat([0, 1], 5), 2, np.array([0.0, 1e-5, 1e-4])
+    anchor = perturb(AT_T, shifts(rng, 1)[0]), covariances(rng, 1)[0], np.zeros((1, 6))
+    of = AT_T, xi, *normal, *gripper, keep, np.arange(HYPOTHESES) == 3, 0.01 / SIZE[:m] ** 2, 2e-4, 1e-4, *anchor
+    (*one, squares), (*other, expected) = kernel.refitted(*of, 1.44, True), by_numpy.refitted(*of, 1.44, True)
+    np.testing.assert_allclose(one[0], other[0], atol=1e-14)
+    np.testing.assert_allclose(one[1], other[1], atol=1e-14)
+    for found, numpys in zip(one[2:], other[2:], strict=True):
+        agree(found, numpys)
+    np.testing.assert_allclose(squares, expected, rtol=1e-8)
+
+
+def tables(rng: np.random.Generator, kinds: int, staying: bool) -> tuple[np.ndarray, np.ndarray]:
+    """(7, n) each, compiled and NumPy's, of some fits of a pose and some of the motion since."""
+    frame, first, away = fits(rng), fits(rng), shifts(rng, 1)[0]
+    rows, prior = rng.integers(0, HYPOTHESES, 9), 10.0 ** rng.uniform(-4.0, 0.0, 9)
+    lever, turn = np.eye(6), np.eye(6)
+    lever[:3, 3:] = -skew(0.01 * rng.normal(size=3))
+    turn[:3, :3] = turn[3:, 3:] = AT_T[:3, :3]
+    since = first.shift, first.covariance, first.of_model, lever, turn, covariances(rng, 1)[0]
+    agree(level_kernel.begun(*since), by_numpy.begun(*since))
+    of = *frame, rows, prior, away, 0.1 * covariances(rng, 1)[0]
+    by_motion, places = 0.1 * rng.normal(size=(kinds, 6, 3)), 0.1 * rng.normal(size=(2, 3))
+    motion = by_motion, shifts(rng, 1)[0], places[0], places[1], shifts(rng, 1)[0]
+    known = 5.0 * covariances(rng, 1)[0] if staying else np.zeros((0, 6))
+    which, alike, farther = rng.integers(0, HYPOTHESES, 9), of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])
+    found = np.full((2, 7, 20), np.nan)
+    for by, table in zip((level_kernel, by_numpy), found, strict=True):
+        by.doubted(*of, alike, farther, 1.2, 1e-2, table, 0)
+        begun = by_numpy.begun(*since)
+        by.moved(*of, which, *begun, lever, *motion, known, 1.2, 1e-2, table, 10)
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("kinds", [0, 1, 3])
+@pytest.mark.parametrize("staying", [True, False])
+def test_doubts_and_those_about_the_motion_are_those_of_numpy(kinds: int, staying: bool):
+    found, expected = tables(np.random.default_rng(kinds), kinds, staying)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-12)
+    improbable = expected[0] <= 1e-2
+    assert 0 < improbable.sum() < 18 and np.isnan(found[1:, improbable]).all()
+    assert np.isfinite(found[:, expected[0] > 1e-2]).all() and np.isnan(found[:, [9, 19]]).all()
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -111,21 +159,20 @@ def test_jumps_are_those_of_numpy(seed: int):
         of = *frame, at, known, off, jumps, prior, stays, 1.44
         np.testing.assert_allclose(kernel.jumped(*of), by_numpy.jumped(*of), rtol=1e-8)
         fit, jump = rng.integers(0, HYPOTHESES, 9), rng.integers(0, 4, 9)
-        after = *frame, at, known, off, jumps, fit, jump
+        after = *frame, at, known, off, jumps, fit, jump, rng.uniform(size=9), 0.5
         agree(kernel.after_jumps(*after), by_numpy.after_jumps(*after))
         share, along = np.array([0.4, 0.3, 0.2, 0.1]), np.array([False, False, True, True])
         weights, endless = 10.0 ** rng.uniform(-4.0, 0.0, (2, HYPOTHESES)), rng.uniform(size=HYPOTHESES) < 0.5
         weights[0, 2] = 0.0
         of = *frame, at, known, off, jumps, share, along, *weights, stays, endless, 1e-3, 1.44
-        (fit, weight, left, *poses), (numbers, expected, rest, *others) = kernel.knocked(*of), by_numpy.knocked(*of)
-        assert 0 < len(fit) < 4 * HYPOTHESES and fit.tolist() == numbers.tolist()
+        (fit, jump, weight, left), (fits_, jumps_, expected, rest) = kernel.knocked(*of), by_numpy.knocked(*of)
+        assert 0 < len(fit) < 4 * HYPOTHESES and fit.tolist() == fits_.tolist() and jump.tolist() == jumps_.tolist()
         np.testing.assert_allclose(np.append(weight, left), np.append(expected, rest), rtol=1e-8)
-        agree(tuple(poses), tuple(others))
 
 
 def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:
     """Of the kernel."""
-    return kernel.levels(prior, away, *tails, risk, 1.02, *QUANTILES)
+    return level_kernel.levels(prior, away, *tails, risk, 1.02, *QUANTILES)
 
 
 @pytest.mark.parametrize("risk", [1e-1, 1e-3, 1e-5, 1e-9, 1e-13])
@@ -157,9 +204,10 @@ def test_tails_of_every_shape_are_those_of_numpy(variances: tuple[float, ...]):
         axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         covariance = np.zeros((1, 6, 6))
         covariance[0, :3, :3] = covariance[0, 3:, 3:] = size * (axes * variances) @ axes.T
-        of = np.zeros((1, 6)), covariance, np.zeros((1, 0, 6)), 1.0
-        away, sigma, factor = kernel.tails(*of)
-        expected = Tails(*by_numpy.tails(*of)[1:])
+        fits, table = (np.zeros((1, 6)), covariance, np.zeros((1, 0, 6))), np.empty((7, 1))
+        Cases.of(("",), np.ones(1), Separation(*fits)).fill(table, 0, 0.0, 1.0)
+        away, sigma, factor = table[1:3], table[3:5], table[5:7]
+        expected = Tails(*by_numpy.tails(*fits, 1.0)[1:])
         assert not away.any()
         np.testing.assert_allclose(sigma, expected.sigma, rtol=tolerance, atol=1e-140)
         for risk in risks:
@@ -257,6 +305,7 @@ KNOCKED_AT = 15  # frame
 def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[FrameRecord]:
     """Of the demo's camera over half a second, with a knock in the middle."""
     monkeypatch.setattr(separation, "kernel", by)
+    monkeypatch.setattr(separation, "level_kernel", level_kernel if by is kernel else by)
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))
@@ -285,4 +334,5 @@ def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, se
 
 def test_doubts_of_none_bound_nothing():
     none = Separation(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 0, 6)))
-    assert Doubts.of((), np.zeros(0), none, 1.0).levels(1e-5) == (0.0, 0.0, "")
+    assert Doubts((Cases.of((), np.zeros(0), none),), 1.0).levels(1e-5) == (0.0, 0.0, "")
+    assert Doubts((), 1.0).levels(1e-5) == (0.0, 0.0, "")

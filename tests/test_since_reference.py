@@ -38,7 +38,7 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript
 from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.integrity import Separation
+from gripmon.track.integrity import Cases, Separation
 
 BY_REFERENCE = PolicySettings(valid_by=ValidBy.REFERENCE)
 FPS, KNOCK_M = 20.0, (0.002, 0.0, 0.002)
@@ -178,10 +178,14 @@ def test_its_covariance_and_its_differences_are_those_of_the_published_pose():
     of_x, of_b = 1e-4 * rng.normal(size=(2, 6)), 1e-4 * rng.normal(size=(3, 6))
     at = at._replace(fits=at.fits._replace(shift=of_b))
     fits = Separation(of_x, np.tile(root @ root.T, (2, 1, 1)), np.zeros((2, 1, 6)))
-    made = at.differences(x_T, reference_T, Opened(0.03, none), None).of(fits, np.array([0, 2]))
-    for row, (x, b) in enumerate(zip(of_x, of_b[[0, 2]], strict=True)):
-        np.testing.assert_allclose(made.shift[row], jacobian[0] @ x + jacobian[1] @ b, rtol=1e-4, atol=1e-9)
-        np.testing.assert_allclose(made.covariance[row], expected, rtol=1e-5, atol=1e-16)
+    which, name = np.array([0, 2]), ("", "")
+    made = at.differences(x_T, reference_T, Opened(0.03, none), None, none).of(Cases.of(name, np.ones(2), fits), which)
+    ways = of_x @ jacobian[0].T + of_b[which] @ jacobian[1].T
+    same = Cases.of(name, np.ones(2), Separation(ways, np.tile(expected, (2, 1, 1)), np.zeros((2, 1, 6))))
+    tables = np.empty((2, 7, 2))
+    for sets, table in zip((made, same), tables, strict=True):
+        sets.fill(table, 0, 0.0, 1.0)
+    np.testing.assert_allclose(tables[0], tables[1], rtol=1e-4)
 
 
 def test_a_wrong_scale_counts_by_the_motion_and_the_jaws_travel():
@@ -194,12 +198,11 @@ def test_a_wrong_scale_counts_by_the_motion_and_the_jaws_travel():
     exact, off = at_reference(reference_T).motion(x_T), at_reference(larger[1]).motion(larger[0])
     way = perturbation_between(exact @ reference_T, off @ reference_T)
     common = CommonError(s, np.zeros((0, 6)), np.zeros(6))
-    fits, rate = Separation(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 1, 6))), rng.normal(size=6)
-    at = at_reference(reference_T)
+    at, rate = at_reference(reference_T), rng.normal(size=6)
 
     def of_scale(opening_m: float) -> np.ndarray:
-        made = at.differences(x_T, reference_T, Opened(opening_m, rate), common)
-        return made.of(fits, np.zeros(1, dtype=np.intp)).of_model[0, -1]
+        made = at.differences(x_T, reference_T, Opened(opening_m, rate), common, np.zeros(6))
+        return made.by_motion[0] @ made.moved + made.travel
 
     np.testing.assert_allclose(-of_scale(0.03), way, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(of_scale(0.05) - of_scale(0.03), s * 0.02 * rate, rtol=1e-9, atol=1e-12)

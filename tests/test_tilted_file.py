@@ -24,7 +24,6 @@ from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, pla
 from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, gripper_digest, own_covariance
-from gripmon.track.integrity import Separation
 
 FILE_T = nominal_cam_T_grip(np.degrees(USUAL_TILT_RAD))
 SIDES = {"left": (-0.025, -0.013), "right": (0.013, 0.025)}
@@ -156,8 +155,7 @@ def test_errors_of_the_assumed_tilt_are_within_the_bound_of_its_error_alone(tilt
 
 def test_it_turns_the_absolute_rotation_alone():
     tilt = Tilt.of(file_of(FILE_T), FILE_T)
-    fits = Separation(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 1, 6)))
-    off = CommonError(0.0, np.zeros((0, 6)), np.zeros(6), tilt).on(fits, FILE_T).of_model[0]
+    off = CommonError(0.0, np.zeros((0, 6)), np.zeros(6), tilt).alike(FILE_T)
     turned = off.T @ off
     assert not turned[:3].any()
     expected = USUAL_TILT_SIGMA_RAD**2 * (np.eye(3) - np.outer(FILE_T[:3, 1], FILE_T[:3, 1]))
@@ -201,7 +199,6 @@ def test_an_error_that_file_and_reference_have_together_counts_once():
     reference = own_reference((size * distance_m, beside_m, USUAL_TILT_SIGMA_RAD))
     model = msgspec.structs.replace(file_of(FILE_T).model, scale_sigma=size)
     edge = {"left1": TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)}
-    fits = Separation(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 1, 6)))
     sight = FILE_T[:3, 3] / distance_m
 
     def sigmas(reference: ReferenceRecord, **states: float) -> tuple[float, float, float]:
@@ -210,7 +207,7 @@ def test_an_error_that_file_and_reference_have_together_counts_once():
         gripper = Gripper(msgspec.structs.replace(model, **states))
         taught = TaughtEdges.of(edge, gripper, FILE_T, None, own_covariance(reference, gripper))
         rows = taught.reference_error, np.zeros(6), Tilt.of(gripper, FILE_T)
-        off = CommonError(gripper.model.scale_sigma, *rows).on(fits, FILE_T).of_model[0]
+        off = CommonError(gripper.model.scale_sigma, *rows).alike(FILE_T)
         beside = np.linalg.norm(off[:, :3] @ np.linalg.svd(sight[None])[2][1])
         return float(np.linalg.norm(off[:, :3] @ sight)), float(beside), float(np.linalg.norm(off[:, 3:], 2))
 

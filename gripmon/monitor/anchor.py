@@ -17,9 +17,9 @@ from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.bounds import SIGMA_INFLATION, Cases, protection_of
+from gripmon.monitor.bounds import SIGMA_INFLATION, protection_of
 from gripmon.monitor.refits import Refits
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, telling, with_known
+from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, follow, telling, with_known
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
@@ -175,8 +175,8 @@ class Anchor:
     def bound(self, risk: float) -> Protection:
         """The protection level of the average itself."""
         fits = self._with_origin(self.fits(), self.cam_T_grip)
-        prior = self._lasting.priors(self.misread)
-        return protection_of(Doubts.of(self._lasting.name, prior, fits, SIGMA_INFLATION), risk)
+        cases = Cases.of(self._lasting.name, self._lasting.priors(self.misread), fits)
+        return protection_of(Doubts((cases,), SIGMA_INFLATION), risk)
 
     def _with_origin(self, fits: Separation, at_T: Array, wander: Array | None = None) -> Separation:
         """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before, a motion of variances
@@ -201,7 +201,7 @@ class Anchor:
         average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
         told = telling(average, at, wander, frame, rows, CONTRADICTION_SQUARE)
         name, with_origin = self._lasting.name, self._with_origin(told, cam_T_grip, wander)
-        return Cases(name, prior, with_origin), Cases(name, prior, told)
+        return Cases.of(name, prior, with_origin), Cases.of(name, prior, told)
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

@@ -14,7 +14,6 @@ reference from elsewhere, a plate or hand-placed corners, has an e of its own, i
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ import numpy as np
 from gripmon.model.geometry import log_rotation
 from gripmon.model.gripper import SIZE_UNKNOWN, Gripper
 from gripmon.model.records import Array
-from gripmon.track.integrity import Doubts, Separation
 
 ACROSS_EDGE = 9
 """Points of each edge at which an error of its depth is added up; more change nothing in the first three digits."""
@@ -82,18 +80,16 @@ class CommonError(NamedTuple):
     offset: Array
     tilt: Tilt = EXACT_PLANE
 
-    def on(self, fits: Separation, cam_T_grip: Array) -> Separation:
-        """The fits near a pose (4, 4) with it."""
+    def alike(self, cam_T_grip: Array) -> Array:
+        """(p, 6) what all fits near a pose (4, 4) are off by, by standard deviations."""
         farther = np.concatenate([self.scale_sigma * cam_T_grip[:3, 3], np.zeros(3)])
         turned = self.tilt.axes_grip @ cam_T_grip[:3, :3].T
-        parts = np.vstack([self.taught, farther, np.column_stack([np.zeros_like(turned), turned])])
-        parts = np.broadcast_to(parts, (len(fits.of_model), *parts.shape))
-        return fits._replace(of_model=np.concatenate([fits.of_model, parts], axis=1))
+        return np.vstack([self.taught, farther, np.column_stack([np.zeros_like(turned), turned])])
 
-    def reaching(self, doubts: Doubts) -> Doubts:
-        """The doubts, each farther away by the offset: it is measured, so it counts once, not as a deviation."""
-        lengths = np.linalg.norm(self.offset.reshape(2, 3), axis=1)
-        return replace(doubts, away=doubts.away + lengths[:, None])
+    @property
+    def farther(self) -> Array:
+        """(2,) lengths of the offset, m and rad: it is measured, so it counts once, not as a deviation."""
+        return np.asarray(np.linalg.norm(self.offset.reshape(2, 3), axis=1))
 
     def of_motion(self, motion: Array, at_T: Array) -> Array:
         """(6, 6) covariance of what taught edges are off by after a ``motion`` (4, 4) from where they were taught, at_T

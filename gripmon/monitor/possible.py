@@ -11,12 +11,12 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import NOTHING_WRONG, Array
 from gripmon.monitor.anchor import Lasting
 from gripmon.monitor.bounds import (
+    SIGMA_INFLATION,
     UNBOUNDED_M,
     UNBOUNDED_RAD,
     ModelError,
-    TwoDoubts,
-    bounds_of,
-    doubts_since,
+    as_uncertain_again,
+    protection_of,
     unbounded,
 )
 from gripmon.monitor.common import CommonError, Tilt
@@ -26,7 +26,7 @@ from gripmon.monitor.since import Bounds
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import Measurement, inner_edges, sides
 from gripmon.track.edges.words import in_words
-from gripmon.track.integrity import Hypotheses, hypotheses_of
+from gripmon.track.integrity import Doubts, Hypotheses, hypotheses_of
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
@@ -88,6 +88,7 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     hypotheses = possible.hypotheses(measurement.normal.edge)
     nothing = Known(cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
     fits = Refits(measurement, hypotheses, tracker.floor_of(measurement), possible.model, nothing)
-    cases = fits.cases(cam_T_grip, hypotheses.prior).among(~hypotheses.sudden)
-    doubts = TwoDoubts(possible.model.absolute(cases, cam_T_grip), doubts_since(cases, None))
-    return bounds_of(doubts, settings.policy.integrity_risk)
+    cases = fits.cases(fits.away(cam_T_grip), hypotheses.prior, ~hypotheses.sudden)
+    absolute, risk = possible.model.absolute([cases], cam_T_grip), settings.policy.integrity_risk
+    since = Doubts((as_uncertain_again(cases),), SIGMA_INFLATION)
+    return Bounds(protection_of(absolute, risk), protection_of(since, risk))

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, invert, skew
+from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import SIZE_UNKNOWN
 from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
@@ -38,16 +38,11 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.common import CommonError
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Separation, of_motion, with_known
+from gripmon.track.integrity import Cases, Moved, Separation, begun
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
 less than such an average claims.
-"""
-
-MOST_SIGMAS = 2.0
-"""Standard deviations by which what is of second order is off at most: a plane's tilt is known to 15 degrees, and
-fingers that are tilted by 30 degrees more, or less, point across the view, or at the camera.
 """
 
 UNSETTLED_FRAMES = 5
@@ -120,42 +115,27 @@ class Average(Protocol):
 
 
 class Differences(NamedTuple):
-    """What makes fits of a pose fits of exp(d) reference, as differences from the published ones: the ``first`` fits
-    b, under g lasting hypotheses, the Jacobians and covariance of :func:`of_motion`, and the pose of a mount that
-    hasn't moved (6,).  The errors by the model that all have besides: of the jaws' ``travel`` (6,), and ``by_motion``
-    (k, 6, 3) times the motion of the camera's origin, which is ``moved`` (3,) as published, of the TCP ``at`` (3,).
+    """What makes fits of a pose fits of exp(d) reference, as differences from the published ones: what g fits at the
+    reference take from that, ``begun``, the Jacobian ``lever`` (6, 6), and the pose of a mount that hasn't moved (6,).
+    The errors by the model that all have besides: of the jaws' ``travel`` (6,), and ``by_motion`` (k, 6, 3) times the
+    motion of the camera's origin, which is ``moved`` (3,) as published, of the TCP ``at`` (3,).
     """
 
-    first: Separation
+    begun: Separation
     lever: Array
-    turn: Array
-    more: Array
-    travel: Array
     by_motion: Array
+    travel: Array
     moved: Array
     at: Array
     unmoved: Array
 
-    def of(self, fits: Separation, lasting: NDArray[np.intp]) -> Separation:
-        """Of h hypotheses; ``lasting`` (h,): under which of the lasting ones b is taken; 0: nothing was wrong then."""
-        made = of_motion(fits, self.first, lasting, self.lever, self.turn, self.more)
-        if not len(self.by_motion):
-            return made
-        # Each by the motion that it has: a file's error does nothing where the mount stayed.
-        moved = self.moved + made.shift[:, :3] - np.cross(made.shift[:, 3:], self.at)
-        rows = np.moveaxis(self.by_motion @ moved.T, 2, 0)
-        # Such an error is in the motion as published, too, which they are reckoned from.
-        origin = rows[..., :3] - np.cross(rows[..., 3:], self.at)
-        second = MOST_SIGMAS * np.einsum("kij,hlj->hkli", self.by_motion, origin).reshape(len(rows), -1, 6)
-        rows[:, 0] += self.travel
-        rows = np.concatenate([second, rows], axis=1)
-        return made._replace(of_model=np.concatenate([made.of_model, rows], axis=1))
-
-    def staying(self, motion: Separation, covariance: Array) -> Separation:
-        """These joined with what is known of the motion beforehand: that the mount stays where it is but for a
-        ``covariance`` (6, 6).
+    def of(self, cases: Cases, lasting: NDArray[np.intp] | None = None, staying: Array | None = None) -> Moved:
+        """The cases, of the motion.  ``lasting`` (r,): under which of the lasting hypotheses b is taken for each; None:
+        nothing was wrong then.  ``staying`` (6, 6): covariance of the motion that a mount makes, where the fits don't
+        contain that.
         """
-        return with_known(motion, self.unmoved, covariance)
+        which = np.zeros(len(cases.prior), dtype=np.intp) if lasting is None else lasting
+        return Moved(cases, which, *self, np.zeros((0, 6)) if staying is None else staying)
 
 
 class AtReference(NamedTuple):
@@ -185,23 +165,25 @@ class AtReference(NamedTuple):
         return np.asarray(lever @ (covariance + turn @ self.fits.covariance[0] @ turn.T) @ lever.T)
 
     def differences(
-        self, cam_T_grip: Array, reference_T: Array, opened: Opened, common: CommonError | None
+        self, cam_T_grip: Array, reference_T: Array, opened: Opened, common: CommonError | None, swing: Array
     ) -> Differences:
-        """How fits near a published pose (4, 4) differ from that of exp(d) reference."""
+        """How fits near a published pose (4, 4) differ from that of exp(d) reference; ``swing`` (6,): variances by
+        which a mount that vibrates differs from its average.
+        """
         lever, turn = self._jacobians(cam_T_grip, reference_T)
         motion = self.motion(cam_T_grip)
-        more: Array = np.zeros((6, 6))
-        travel: Array = np.zeros(6)
-        by_motion: Array = np.zeros((0, 6, 3))
+        more, travel, by_motion = np.diag(swing), np.zeros(6), np.zeros((0, 6, 3))
         if common is not None:
-            more, travel_m = common.of_motion(motion, self.cam_T_grip), opened.jaw_opening_m - self.jaw_opening_m
+            travel_m = opened.jaw_opening_m - self.jaw_opening_m
+            more = common.of_motion(motion, self.cam_T_grip) + more
             # Of unknown size, lengths are in units of the distance, of which the motion is exact.
             size = common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0
             travel = size * travel_m * (lever @ opened.pose_rate)
             by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
         at_T = motion @ reference_T
         unmoved = perturbation_between(at_T, reference_T)
-        return Differences(self.fits, lever, turn, more, travel, by_motion, motion[:3, 3], at_T[:3, 3], unmoved)
+        first = begun(self.fits, lever, turn, more)
+        return Differences(first, lever, by_motion, travel, motion[:3, 3].copy(), at_T[:3, 3].copy(), unmoved)
 
     def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
         """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is
@@ -210,7 +192,8 @@ class AtReference(NamedTuple):
         rotation = cam_T_grip[:3, :3] @ self.cam_T_grip[:3, :3].T
         turn, lever = np.zeros((6, 6)), np.eye(6)
         turn[:3, :3] = turn[3:, 3:] = rotation
-        lever[:3, 3:] = -skew(rotation @ (reference_T[:3, 3] - self.cam_T_grip[:3, 3]))
+        x, y, z = (rotation @ (reference_T[:3, 3] - self.cam_T_grip[:3, 3])).tolist()
+        lever[:3, 3:] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
         return lever, turn
 
 

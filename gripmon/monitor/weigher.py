@@ -7,10 +7,10 @@ knocked, which is rare: the average of the proven poses is the anchor.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
@@ -18,9 +18,9 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
 from gripmon.monitor.anchor import Anchor
-from gripmon.monitor.bounds import Cases, TwoDoubts, bounds_of, doubts_since, larger, reaching, unbounded
+from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits
@@ -30,7 +30,7 @@ from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Knocks, Mount, bounds
+from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, Moved, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
@@ -174,12 +174,19 @@ class Weigher:
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
         without = self._without_ends(measurement, fits, besides, displaced)
-        wrong, left_out = self._knocked_cases(fits, without, cam_T_grip, prior, knocks, odds)
-        cases = Cases.together([fits.cases(cam_T_grip, prior, anchored).among(fits.stays), *wrong])
-        differences = self._differences(fits, cam_T_grip)
-        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), doubts_since(cases, differences))
-        doubts = self._with_lasting(doubts, fits, differences, cam_T_grip, displaced, now_s, knocks)
-        both = self._with_questions(bounds_of(doubts, risk, left_out), cam_T_grip, displaced)
+        wrong = self._knocks_under(fits, without, prior, knocks, odds)
+        left_out = sum(found.left_out for _, found in wrong)
+        # And what may have been wrong all along, or in the reference's frames.
+        away, differences = fits.away(cam_T_grip), fits.model.differences(cam_T_grip, fits.opened, self.swing)
+        stayed = fits.cases(away, prior, fits.stays, anchored)
+        ever, told, at_first = self._lasting_cases(fits, away, cam_T_grip, displaced, now_s, differences is not None)
+        count = _count([stayed]) + sum(len(found.prior) for _, found in wrong)
+        count += max(_count(ever), _count([*told, *at_first]))
+        now = [stayed, *(of.after(away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
+        absolute = fits.model.absolute([*now, *ever], cam_T_grip)
+        since = Doubts(tuple(self._of_motion(now, told, at_first, differences, knocks, displaced)), SIGMA_INFLATION)
+        both = Bounds(protection_of(absolute, risk, left_out), protection_of(since, risk, left_out))
+        both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = fits if proven or without is None else without
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
@@ -242,36 +249,43 @@ class Weigher:
             absolute = larger(absolute, self._not_as_expected(self.unexplained))
         return both._replace(absolute=absolute)
 
-    def _with_lasting(
-        self,
-        doubts: TwoDoubts,
-        fits: Refits,
-        differences: Differences | None,
-        cam_T_grip: Array,
-        displaced: bool,
-        now_s: float,
-        knocks: Knocks,
-    ) -> TwoDoubts:
-        """The doubts with those of what may have been wrong all along, or in the reference's frames."""
-        anchor, since, lasting = self.anchor, list[Cases](), list[NDArray[np.intp]]()
-        ever = MISREAD_PROBABILITY**2 if anchor is None else anchor.misread  # the least that proves a pose
-        prior = self._lasting.priors(ever)
-        every = np.arange(len(prior))
+    def _lasting_cases(
+        self, fits: Refits, away: Array, cam_T_grip: Array, displaced: bool, now_s: float, since: bool
+    ) -> tuple[list[Cases], list[Cases], list[Cases]]:
+        """What may have been wrong all along with a pose (4, 4), and, by what is known without the anchor's origin,
+        with the motion since the reference; and, if there is a motion ``since`` its frames, in those alone.  None of
+        the first two without an anchor there.
+        """
+        anchor, lasting = self.anchor, self._lasting
+        ever, told, at_first = list[Cases](), list[Cases](), list[Cases]()
         if anchor is not None and not displaced:
-            rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
-            absolute, told = anchor.cases(cam_T_grip, fits, rows, wander, prior)
-            doubts = replace(doubts, absolute=doubts.absolute + fits.model.absolute(absolute, cam_T_grip))
-            since, lasting = [told], [every]
-        if differences is not None:
-            anchored = None if displaced else fits.anchored
-            at_first = self._lasting.priors(self._since.misread)
-            since.append(fits.wrong_at_first(self._lasting.name, at_first, cam_T_grip, anchored))
-            lasting.append(every[1:])
-        if not since:
-            return doubts
-        staying = self._staying(knocks, displaced)
-        more = doubts_since(Cases.together(since), differences, np.concatenate(lasting), staying)
-        return replace(doubts, since=doubts.since + more)
+            rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
+            absolute, without_origin = anchor.cases(cam_T_grip, fits, rows, self._wander(now_s), prior)
+            ever, told = [absolute], [without_origin]
+        if since:
+            anchored, prior = None if displaced else fits.anchored, lasting.priors(self._since.misread)
+            at_first = [fits.wrong_at_first(lasting.name, prior, away, anchored)]
+        return ever, told, at_first
+
+    def _of_motion(
+        self,
+        now: list[Cases],
+        told: list[Cases],
+        at_first: list[Cases],
+        differences: Differences | None,
+        knocks: Knocks,
+        displaced: bool,
+    ) -> Iterator[Cases | Moved]:
+        """What may be wrong with the motion since the reference, of what is wrong ``now``, all along, or ``at_first``
+        alone; without ``differences`` this frame is the first one.
+        """
+        if differences is None:
+            yield from map(as_uncertain_again, [*now, *told])
+            return
+        yield from map(differences.of, now)
+        staying, every = self._staying(knocks, displaced), np.arange(len(self._lasting.name))
+        yield from (differences.of(each, every, staying) for each in told)
+        yield from (differences.of(each, every[1:], staying) for each in at_first)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
@@ -281,13 +295,6 @@ class Weigher:
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
-
-    def _differences(self, fits: Refits, cam_T_grip: Array) -> Differences | None:
-        """What makes fits near a pose (4, 4) those of the motion since the reference's frames; None before these.  Of a
-        mount that vibrates their average and its place at their stamp differ by that.
-        """
-        found = fits.model.differences(cam_T_grip, fits.opened)
-        return None if found is None else found._replace(more=found.more + np.diag(self.swing))
 
     def _staying(self, knocks: Knocks, displaced: bool) -> Array:
         """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
@@ -323,27 +330,20 @@ class Weigher:
         floor = self._tracker.floor_of(measurement)
         return Refits(measurement, hypotheses, floor, fits.model, fits.known, together=False)
 
-    def _knocked_cases(
-        self,
-        fits: Refits,
-        without: Refits | None,
-        cam_T_grip: Array,
-        prior: Array,
-        knocks: Knocks,
-        odds: tuple[float, float],
-    ) -> tuple[list[Cases], float]:
-        """What may be wrong if the mount was knocked since it was last known, and the probability of what is left out.
+    def _knocks_under(
+        self, fits: Refits, without: Refits | None, prior: Array, knocks: Knocks, odds: tuple[float, float]
+    ) -> list[tuple[Refits, Knocked]]:
+        """The knocks that the mount may have got since it was last known, by the fits and by those without the ends.
         ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
         """
         ends = fits.hypotheses.ends
         if without is fits:  # then that of the ends is the same as that nothing is wrong
             prior = prior * (np.arange(len(prior)) != ends)
-        cases, left_out = fits.knocked(cam_T_grip, prior, knocks, odds, self._least)
-        if without is None or without is fits:
-            return [cases], left_out
-        both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
-        more, more_out = without.knocked(cam_T_grip, both, knocks, odds, self._least)
-        return [cases, more], left_out + more_out
+        found = [(fits, fits.knocked(prior, knocks, odds, self._least))]
+        if without is not None and without is not fits:
+            both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
+            found.append((without, without.knocked(both, knocks, odds, self._least)))
+        return found
 
     @property
     def _least(self) -> float:
@@ -435,11 +435,13 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        cases = fits.cases(cam_T_grip, fits.hypotheses.prior)
-        since = doubts_since(cases, self._differences(fits, cam_T_grip))
-        doubts = TwoDoubts(fits.model.absolute(cases, cam_T_grip), since)
-        both = bounds_of(doubts, self._policy.integrity_risk)
-        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
+        cases = fits.cases(fits.away(cam_T_grip), fits.hypotheses.prior, np.ones(len(fits.stays), dtype=np.bool_))
+        if self._policy.valid_by is ValidBy.ABSOLUTE:
+            doubts = fits.model.absolute([cases], cam_T_grip)
+        else:
+            found = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+            doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
+        return past_alert_limit(protection_of(doubts, self._policy.integrity_risk), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
@@ -465,6 +467,10 @@ class Weigher:
             floor = self._tracker.floor_of(measurement)
             self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]
+
+
+def _count(sets: list[Cases]) -> int:
+    return sum(len(each.prior) for each in sets)
 
 
 def _contradicts(way: Array, covariance: Array) -> bool:

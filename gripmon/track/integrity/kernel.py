@@ -1,5 +1,5 @@
-"""The arithmetic of a frame's protection level, compiled: fits under h hypotheses, alone and with the anchor, the bank
-of filters behind the anchor, and the root of the sum over the hypotheses' tails.
+"""The arithmetic behind a frame's protection level, compiled: fits under h hypotheses, alone and with the anchor,
+knocks since, and the bank of filters behind the anchor.
 
 h hypotheses, v edges, f parts of the gripper, m unknowns of which the first n are asked for, g averages; lengths in m
 and rad.  What they are for stands in :mod:`~gripmon.track.integrity.separation`.  Tests hold each against the function
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.compiled import compiled
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 
 Bools = NDArray[np.bool_]
@@ -264,6 +265,66 @@ def with_and_without(
 
 
 @compiled
+def refitted(
+    predicted_T: Array,
+    xi: Array,
+    pull: Array,
+    information: Array,
+    middle: Array,
+    lasting: Array,
+    edge: Ints,
+    finger: Ints,
+    fingers: int,
+    longer: Array,
+    keep: Array,
+    opening: Bools,
+    vague: Array,
+    way_m: float,
+    sigma_m: float,
+    anchor_T: Array,
+    known: Array,
+    known_off: Array,
+    times: float,
+    together: bool,
+) -> tuple[Array, Array, tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
+    """A frame's fit under h hypotheses, by :func:`with_and_without`: its pose (4, 4), ``xi`` (m,) from the prediction,
+    where ``anchor_T`` (4, 4) is from there (6,), and what that function returns.
+
+    ``pull`` to ``lasting``, of the edges ``edge`` (v,): as the fit has them; ``finger`` (e,) of each edge, of so many
+    ``fingers``, and by how much one may be ``longer`` (3,), gripper frame, m: it pulls at a fit by all its edges
+    together, an edge that lies beside its place by itself, alike in every frame.  ``vague`` (m,): information that
+    keeps the unknowns solvable whatever is seen; an opening that is known is off the fit's by ``way_m``, with the
+    standard deviation ``sigma_m``, but for the hypotheses that doubt it, ``opening`` (h,).
+    """
+    count, (edges, m) = len(keep), pull.shape
+    fit_T = perturb(predicted_T, xi[:6])
+    at = perturbation_between(fit_T, anchor_T)
+    held, held_pull = np.zeros((count, m, m)), np.zeros((count, m))
+    for h in range(count):
+        for i in range(m):
+            held[h, i, i] = vague[i]
+        if m == 7:
+            if not opening[h]:
+                held[h, 6, 6] = max(sigma_m, 1e-6) ** -2
+            held_pull[h, 6] = held[h, 6, 6] * way_m
+    model, part, tip = np.empty((2, edges, m)), np.empty((2, edges), np.intp), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            tip[i] += fit_T[i, k] * longer[k]
+    for v in range(edges):
+        part[0, v], part[1, v] = finger[edge[v]], fingers + edge[v]
+        for i in range(m):
+            model[0, v, i], model[1, v, i] = 0.0, lasting[v, i]
+            for k in range(3):
+                model[0, v, i] += information[v, i, k] * tip[k]
+    parts = fingers + len(finger)
+    of = with_and_without(
+        pull, information, middle, model, part, parts, keep, held, held_pull, at, known, known_off, times, together
+    )
+    return fit_T, at, of[0], of[1], of[2]
+
+
+@compiled
 def _blend(mean: Array, other: Array, share: Array, upper: Array, backward: bool, out: Array) -> None:
     """``out`` (6,): mean + S U' (other - mean), S = ``share`` and U = ``upper``; the roles swapped if ``backward``."""
     for i in range(6):
@@ -277,7 +338,7 @@ def _blend(mean: Array, other: Array, share: Array, upper: Array, backward: bool
 
 
 @compiled
-def _join(
+def join(
     mean: Array,
     before: Array,
     off: Array,
@@ -389,21 +450,26 @@ def after_jumps(
     jumps: Array,
     fit: Ints,
     jump: Ints,
+    probability: Array,
+    share: float,
 ) -> tuple[Array, Array, Array]:
-    """The poses after r of the jumps of :func:`jumped`, by the fits and what was known: :func:`_join` of the latter,
+    """The poses after r of the jumps of :func:`jumped`, by the fits and what was known: :func:`join` of the latter,
     with C + J, and the former, shift (r, 6), covariance (r, 6, 6), and errors by the model (r, f, 6), ``off`` (h, f, 6)
-    and ``known_off`` (f or 1, 6).  ``fit`` and ``jump`` (r,): the number of each.
+    and ``known_off`` (f or 1, 6).  ``fit`` and ``jump`` (r,): the number of each.  Zeros for those of a
+    ``probability`` (r,) of no more than a ``share``.
     """
     count, parts = len(fit), off.shape[1]
-    shifts, covariances, offs = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, parts, 6))
+    shifts, covariances, offs = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, parts, 6))
     before, work = np.empty((6, 6)), np.empty((5, 6, 6))
     for r in range(count):
+        if probability[r] <= share:
+            continue
         h, c = fit[r], jump[r]
         for i in range(6):
             for j in range(6):
                 before[i, j] = known[i, j] + jumps[c, i, j]
         of = shift[h], covariance[h], off[h]
-        _join(at, before, known_off, of, (shifts[r], covariances[r], offs[r]), work)
+        join(at, before, known_off, of, (shifts[r], covariances[r], offs[r]), work)
     return shifts, covariances, offs
 
 
@@ -424,9 +490,9 @@ def knocked(
     endless: Bools,
     least: float,
     times: float,
-) -> tuple[Ints, Array, float, Array, Array, Array]:
-    """The r fits and jumps that are more probable together than ``least``: numbers of the fits (r,), probabilities
-    (r,), that of all others, and the poses then as by :func:`after_jumps`.
+) -> tuple[Ints, Ints, Array, float]:
+    """The r fits and jumps that are more probable together than ``least``: numbers of the fits (r,) and of the jumps
+    (r,), their probabilities (r,), and that of all others.
 
     ``share`` (c,): how probable each of the ``jumps`` (c, 6, 6) is once there is one, ``along`` (c,): those that an
     ``endless`` (h,) fit doesn't show, so that nothing is held against them; ``prior`` (h,): of the fits; ``probable``
@@ -453,163 +519,14 @@ def knocked(
             if weight[h, c] > least:
                 fit[r], jump[r], probability[r] = h, c, weight[h, c]
                 r += 1
-    shifts, covariances, offs = after_jumps(shift, covariance, off, at, known, known_off, jumps, fit, jump)
-    return fit, probability, left_out, shifts, covariances, offs
-
-
-@compiled
-def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
-    """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
-
-    The eigenvalues of B = (C - q) / p, with p so that B has the determinant 2 r and the squares 6, are
-    2 cos(phi + 2 pi k / 3), cos(3 phi) = r (Smith 1961); the product of the largest one's distances to the others is
-    3 (x² - 1), the derivative of the characteristic polynomial.
-    """
-    q = (xx + yy + zz) / 3.0
-    a, b, c = xx - q, yy - q, zz - q
-    p = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
-    x = 0.0
-    if p > 0.0:
-        a, b, c, d, e, f = a / p, b / p, c / p, xy / p, xz / p, yz / p
-        half_determinant = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
-        x = 2.0 * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3.0)
-    largest = max(q + p * x, 1e-300)
-    if q <= 0.0:
-        return math.sqrt(largest), 0.0
-    left = min(max(3.0 * (p / largest) ** 2 * (x * x - 1.0), 1e-24), 1.0)
-    return math.sqrt(largest), -0.5 * math.log10(left)
-
-
-@compiled
-def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
-    """Lengths (2, h) of shifts (h, 6), in position and in rotation, and the tails of their errors: sigma and factor
-    (2, h), with the covariances (h, 6, 6) and errors by the model (h, f, 6).
-    """
-    count = len(shift)
-    away, sigma, factor = np.empty((2, count)), np.empty((2, count)), np.empty((2, count))
-    block = np.empty((3, 3))
-    for part in range(2):
-        first = 3 * part
-        for h in range(count):
-            total = 0.0
-            for i in range(3):
-                total += shift[h, first + i] ** 2
-                for j in range(i + 1):
-                    block[i, j] = inflation**2 * covariance[h, first + i, first + j]
-                    for f in range(of_model.shape[1]):
-                        block[i, j] += of_model[h, f, first + i] * of_model[h, f, first + j]
-            away[part, h] = math.sqrt(total)
-            sigma[part, h], factor[part, h] = _tail(
-                block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
-            )
-    return away, sigma, factor
-
-
-@compiled
-def _radius(log_risk: float, factor: float, squares: Array, spacing: float) -> float:
-    """Length over sigma that is exceeded with a probability (power of ten)."""
-    last = squares.shape[1] - 1
-    out = math.inf
-    for table in range(2):
-        place = -(log_risk - factor if table == 0 else log_risk) / spacing
-        if place >= last:
-            value = squares[table, last]
-        elif place <= 0.0:
-            value = squares[table, 0]
-        else:
-            k = int(place)
-            value = squares[table, k] + (place - k) * (squares[table, k + 1] - squares[table, k])
-        out = min(out, value)
-    return math.sqrt(out)
-
-
-@compiled
-def _beyond(square: float, factor: float, squares: Array, spacing: float, guide: Ints, step: float) -> float:
-    """Probability of a normalised square: ``guide`` (2, n) is where to begin in the table for each ``step``."""
-    last = squares.shape[1] - 1
-    out = 0.0
-    for table in range(2):
-        place = float(last)
-        if square < squares[table, last]:
-            k = guide[table, int(square / step)]
-            while squares[table, k + 1] <= square:
-                k += 1
-            place = k + (square - squares[table, k]) / (squares[table, k + 1] - squares[table, k])
-        log_tail = -spacing * place
-        out = min(out, log_tail + factor) if table == 0 else min(out, log_tail)
-    return math.exp(out * math.log(10.0))
-
-
-@compiled
-def levels(
-    prior: Array,
-    away: Array,
-    sigma: Array,
-    factor: Array,
-    risk: float,
-    near: float,
-    squares: Array,
-    spacing: float,
-    guide: Ints,
-    step: float,
-) -> tuple[float, float, int]:
-    """Protection levels of position and of rotation, m and rad, and the number of the hypothesis that the position's
-    owes most to; -1 where all together are less probable than the risk.
-
-    The levels are where the sum over the hypotheses of ``prior`` (h,) times the tail beyond level - ``away`` (2, h) is
-    ``risk``, found between bounds by halving their ratio's logarithm down to a factor ``near``; the larger end counts.
-    Those of less than an equal share of the risk take their ``prior`` off it.  ``squares`` to ``step``: the tables of
-    :mod:`~gripmon.track.integrity.quantiles`.
-    """
-    share, left, count = risk / len(prior), risk, 0
-    for h in range(len(prior)):
-        if prior[h] > share:
-            count += 1
-        else:
-            left -= prior[h]
-    if not count:
-        return 0.0, 0.0, -1
-    least, most = np.zeros(2), np.zeros(2)
-    for h in range(len(prior)):
-        if prior[h] <= share:
-            continue
-        alone = math.log10(max(left / prior[h], 1e-300))
-        equally = math.log10(max(left / count / prior[h], 1e-300))
-        for part in range(2):
-            s, f = sigma[part, h], factor[part, h]
-            if alone < 0.0:  # what is less probable than the risk may lie beyond the level altogether
-                least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
-            most[part] = max(most[part], away[part, h] + s * _radius(equally, f, squares, spacing))
-    # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
-    for part in range(2):
-        least[part] = max(least[part], 1e-3 * most[part])
-    while most[0] > near * least[0] or most[1] > near * least[1]:
-        for part in range(2):
-            middle = math.sqrt(least[part] * most[part])
-            total = 0.0
-            for h in range(len(prior)):
-                if prior[h] > share:
-                    length = max(middle - away[part, h], 0.0) / sigma[part, h]
-                    total += prior[h] * _beyond(length * length, factor[part, h], squares, spacing, guide, step)
-            if total <= left:
-                most[part] = middle
-            else:
-                least[part] = middle
-    largest, owed = -1.0, -1
-    for h in range(len(prior)):
-        if prior[h] > share:
-            length = max(most[0] - away[0, h], 0.0) / sigma[0, h]
-            part_of_it = prior[h] * _beyond(length * length, factor[0, h], squares, spacing, guide, step)
-            if part_of_it > largest:
-                largest, owed = part_of_it, h
-    return most[0], most[1], owed
+    return fit, jump, probability, left_out
 
 
 @compiled
 def follow(
     mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """One more measurement for each of g Kalman filters, :func:`_join`: their means (g, 6), covariances (g, 6, 6) and
+    """One more measurement for each of g Kalman filters, :func:`join`: their means (g, 6), covariances (g, 6, 6) and
     errors by the model (g, f, 6) after it, and the traces of their gains (g,).  ``creep`` (6,): variances that the
     filters' covariances have grown by.
     """
@@ -621,7 +538,7 @@ def follow(
             for j in range(6):
                 before[i, j] = covariance[g, i, j] + (creep[i] if i == j else 0.0)
         of, out = (shift[g], of_frame[g], of_model[g]), (new_mean[g], new_covariance[g], new_off[g])
-        taken[g] = _join(mean[g], before, off[g], of, out, work)
+        taken[g] = join(mean[g], before, off[g], of, out, work)
     return new_mean, new_covariance, new_off, taken
 
 
@@ -634,74 +551,8 @@ def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Ar
     none, work = np.zeros((off.shape[1], 6)), np.empty((5, 6, 6))
     for h in range(len(shift)):
         out = new_shift[h], new_covariance[h], new_off[h]
-        _join(shift[h], covariance[h], off[h], (at, known, none), out, work)
+        join(shift[h], covariance[h], off[h], (at, known, none), out, work)
     return new_shift, new_covariance, new_off
-
-
-@compiled
-def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> None:
-    """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
-    for i in range(6):
-        for j in range(6):
-            half[i, j] = 0.0
-            for k in range(6):
-                half[i, j] += jacobian[i, k] * covariance[k, j]
-    for i in range(6):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(6):
-                total += half[i, k] * jacobian[j, k]
-            out[i, j] += total
-            if j < i:
-                out[j, i] += total
-
-
-@compiled
-def of_motion(
-    shift: Array,
-    covariance: Array,
-    off: Array,
-    first: Ints,
-    first_shift: Array,
-    first_covariance: Array,
-    first_off: Array,
-    lever: Array,
-    turn: Array,
-    more: Array,
-) -> tuple[Array, Array, Array]:
-    """Fits x (h, 6) with their covariances (h, 6, 6) and errors by the model (h, f, 6), made those of the motion since
-    the ``first`` (h,) of g fits b: the differences L (x - T b), with the Jacobians ``lever`` L and ``turn`` T (6, 6),
-    covariances L (C_x + T C_b T' + M) L', M = ``more`` (6, 6), and differences of the errors by the model.
-    """
-    count, parts = len(first), off.shape[1]
-    shifts, covariances, offs = np.empty((count, 6)), np.zeros((count, 6, 6)), np.empty((count, parts, 6))
-    half, turned = np.empty((6, 6)), lever @ turn
-    begun, begun_off = np.zeros((len(first_shift), 7, 6)), np.empty((len(first_shift), parts, 6))
-    for g in range(len(first_shift)):
-        _seen_from(first_covariance[g], turned, half, begun[g, :6])
-        _seen_from(more, lever, half, begun[g, :6])
-        for i in range(6):
-            for k in range(6):
-                begun[g, 6, i] += turned[i, k] * first_shift[g, k]
-            for f in range(parts):
-                begun_off[g, f, i] = 0.0
-                for k in range(6):
-                    begun_off[g, f, i] += turned[i, k] * first_off[g, f, k]
-    for h in range(count):
-        g = first[h]
-        _seen_from(covariance[h], lever, half, covariances[h])
-        for i in range(6):
-            shifts[h, i] = -begun[g, 6, i]
-            for k in range(6):
-                covariances[h, i, k] += begun[g, i, k]
-                shifts[h, i] += lever[i, k] * shift[h, k]
-        for f in range(parts):
-            for i in range(6):
-                total = -begun_off[g, f, i]
-                for k in range(6):
-                    total += lever[i, k] * off[h, f, k]
-                offs[h, f, i] = total
-    return shifts, covariances, offs
 
 
 @compiled

@@ -14,7 +14,6 @@ The arithmetic stands in :mod:`~gripmon.track.integrity.kernel`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from gripmon.model.records import Array
-from gripmon.track.integrity import kernel
+from gripmon.track.integrity import kernel, level_kernel
 from gripmon.track.integrity.knocks import Knocks
 
 LEVEL_TOLERANCE_RATIO = 1.02
@@ -106,29 +105,36 @@ class Sums(NamedTuple):
         return Separation(*kernel.separate(*self, unknowns))
 
 
-def with_and_without(
-    pull: Array,
-    information: Array,
-    middle: Array,
-    model: tuple[Array, NDArray[np.intp], int],
-    keep: Array,
-    known: Array,
-    known_pull: Array,
-    at: Array,
-    covariance: Array,
-    of_model: Array,
+class Refitted(NamedTuple):
+    """One frame's fits under all hypotheses: the pose ``fit_T`` (4, 4) that they are shifts from, where the pose that
+    is known from before is ``at`` (6,), the fits ``alone`` and ``anchored``, with that pose as one more measurement,
+    and the normalised squares (h,) of the former's distances from it.
+    """
+
+    fit_T: Array
+    at: Array
+    alone: Separation
+    anchored: Separation
+    square: Array
+
+
+def refitted(
+    prediction: tuple[Array, Array],
+    normal: tuple[Array, Array, Array, Array, NDArray[np.intp]],
+    model: tuple[NDArray[np.intp], int, Array],
+    doubted: tuple[Array, NDArray[np.bool_], Array],
+    opening: tuple[float, float],
+    known: tuple[Array, Array, Array],
     times: float,
     together: bool = True,
-) -> tuple[Separation, Separation, Array]:
-    """The fits of six unknowns by what :meth:`Sums.of_kept` is made of, and the same with these known to be ``at`` (6,)
-    but for a ``covariance`` (6, 6), and off by ``of_model`` (f, 6), or (1, 6) of zeros.  And the normalised squares
-    (h,) of the former's distances from there, by ``times`` their own covariances and that one.  Not ``together``:
-    without the second ones, of which there are none then.
+) -> Refitted:
+    """The fits of a frame by what :func:`kernel.refitted` is told, in this order, with the pose that is ``known`` but
+    for a covariance (6, 6), and off by the model (f, 6), or (1, 6) of zeros.  The squares are by ``times`` the fits'
+    own covariances and that one.  Not ``together``: without the anchored ones, of which there are none then.
     """
-    pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
-    of = pull, information, middle, *model, keep, known, known_pull, at, covariance, of_model, times
-    alone, with_pose, squares = kernel.with_and_without(*of, together)
-    return Separation(*alone), Separation(*with_pose), squares
+    of = *prediction, *normal, *model, *doubted, *opening, *known, times, together
+    fit_T, at, alone, anchored, squares = kernel.refitted(*of)
+    return Refitted(fit_T, at, Separation(*alone), Separation(*anchored), squares)
 
 
 def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:
@@ -144,13 +150,9 @@ def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
     return Separation(*kernel.with_known(*fits, at, covariance))
 
 
-def of_motion(
-    fits: Separation, first: Separation, which: NDArray[np.intp], lever: Array, turn: Array, more: Array
-) -> Separation:
-    """Fits x made those of the motion since the ones of ``first`` b that are their ``which`` (h,): L (x - T b) with the
-    Jacobians ``lever`` L and ``turn`` T (6, 6), and covariances L (C_x + T C_b T' + M) L', M = ``more`` (6, 6).
-    """
-    return Separation(*kernel.of_motion(*fits, which, *first, lever, turn, more))
+def begun(first: Separation, lever: Array, turn: Array, more: Array) -> Separation:
+    """What the fits ``first`` at the reference take from a motion since, see :func:`level_kernel.begun`."""
+    return Separation(*level_kernel.begun(*first, lever, turn, more))
 
 
 def telling(
@@ -163,11 +165,20 @@ def telling(
     return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
 
 
+class Knocked(NamedTuple):
+    """That a pose was knocked, under r of h hypotheses: which ``fit`` (r,) and which ``jump`` (r,), the ``prior`` (r,)
+    of both together, and ``left_out``, that of all others.
+    """
+
+    fit: NDArray[np.intp]
+    jump: NDArray[np.intp]
+    prior: Array
+    left_out: float
+
+
 def knocked(
     frame: Separation,
-    at: Array,
-    known: Array,
-    of_model: Array,
+    known: tuple[Array, Array, Array],
     knocks: Knocks,
     prior: Array,
     probable: Array,
@@ -175,20 +186,29 @@ def knocked(
     endless: NDArray[np.bool_],
     least: float,
     times: float,
-) -> tuple[NDArray[np.intp], Array, Separation, float]:
-    """Under which hypotheses (r,) the pose, known to have been ``at`` (6,) but for a covariance ``known`` (6, 6) and
-    ``of_model`` (f or 1, 6), was knocked, with which probability (r,), and where it is then, given the frame's fits.
-    And the probability of what is less probable than ``least``, together, which is left out.
+) -> Knocked:
+    """Under which hypotheses the pose, ``known`` to have been somewhere (6,) but for a covariance (6, 6) and errors by
+    the model (f or 1, 6), was knocked, given the frame's fits.  What is less probable than ``least`` is left out.
 
     ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether it may as well
     have stayed; ``endless`` (h,): whether no end of a finger is left, which alone show a knock along the fingers: that
     it is exactly along them isn't held against it then.  ``times``: factor on the fits' covariances for their tails.
     """
-    known_before, of = (at, known, of_model), (knocks.covariance, knocks.share, knocks.along)
-    fit, weight, left_out, *fits = kernel.knocked(
-        *frame, *known_before, *of, prior, probable, stays, endless, least, times
+    of = knocks.covariance, knocks.share, knocks.along
+    return Knocked(*kernel.knocked(*frame, *known, *of, prior, probable, stays, endless, least, times))
+
+
+def after_knocks(
+    frame: Separation, known: tuple[Array, Array, Array], knocks: Knocks, of: Knocked, share: float
+) -> Separation:
+    """Where the pose is after the knocks ``of`` :func:`knocked` that are more probable than a ``share``; zeros for the
+    others.
+    """
+    shift, covariance, of_model = frame
+    jumps = knocks.covariance
+    return Separation(
+        *kernel.after_jumps(shift, covariance, of_model, *known, jumps, of.fit, of.jump, of.prior, share)
     )
-    return fit, weight, Separation(*fits), left_out
 
 
 class Tails(NamedTuple):
@@ -227,68 +247,120 @@ def bounds(covariance: Array, risk: Array) -> Array:
     return Tails.of(covariance).radius(risk)
 
 
-@dataclass(frozen=True, slots=True)
-class Doubts:
-    """What may be wrong with a published pose, h things of the probabilities ``prior`` (h,) with the ``name`` (h,): how
-    far ``away`` (2, h) the other fit is, in position and in rotation, and the ``tails`` (2, h) of that one's error.
+class Cases(NamedTuple):
+    """Things that may be wrong with a published pose, r of them: ``name``, ``prior`` (r,), and which ``rows`` (r,) of
+    the ``fits`` is the one under each.  The fits count from a pose that the published one is ``away`` (6,) from, and
+    the covariance ``more`` (6, 6) comes on top.  ``alike`` (p, 6): errors by the model that all have, by their standard
+    deviations; ``farther`` (2,): what is added to their distances, m and rad.
     """
 
     name: tuple[str, ...]
     prior: Array
+    rows: NDArray[np.intp]
+    fits: Separation
     away: Array
-    tails: Tails
+    more: Array = np.zeros((6, 6))
+    alike: Array = np.zeros((0, 6))
+    farther: Array = np.zeros(2)
 
     @classmethod
-    def of(cls, name: tuple[str, ...], prior: Array, fits: Separation, inflation: float) -> Doubts:
-        """``fits`` with shifts (h, 6) from the published pose to the others.
+    def of(cls, name: tuple[str, ...], prior: Array, fits: Separation) -> Cases:
+        """``fits`` with shifts (h, 6) from the published pose."""
+        return cls(name, prior, np.arange(len(prior)), fits, np.zeros(6))
 
-        ``inflation``: factor on standard deviations with which a normal distribution bounds the tails of real errors.
-        """
-        away, sigma, factor = kernel.tails(*fits, inflation)
-        return cls(name, prior, away, Tails(sigma, factor))
+    def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
+        """Into a table, see :func:`level_kernel.doubted`."""
+        of = *self.fits, self.rows, self.prior, self.away, self.more, self.alike, self.farther
+        level_kernel.doubted(*of, inflation, share, table, first)
 
-    def among(self, chosen: NDArray[np.bool_]) -> Doubts:
-        """Those that are ``chosen`` (h,)."""
-        if chosen.all():
-            return self
-        away, *tails = (each.compress(chosen, axis=1) for each in (self.away, *self.tails))
-        return Doubts(tuple(compress(self.name, chosen.tolist())), self.prior[chosen], away, Tails(*tails))
 
-    def __add__(self, other: Doubts) -> Doubts:
-        return Doubts(
-            self.name + other.name,
-            np.concatenate([self.prior, other.prior]),
-            np.concatenate([self.away, other.away], axis=1),
-            Tails(
-                np.concatenate([self.tails.sigma, other.tails.sigma], axis=1),
-                np.concatenate([self.tails.factor, other.tails.factor], axis=1),
-            ),
-        )
+class Moved(NamedTuple):
+    """The same about the motion since the reference, where fits ``begun`` under g hypotheses; ``which`` (r,) of them
+    each of the ``cases`` goes with.  ``lever`` (6, 6), ``by_motion`` (k, 6, 3), ``travel`` (6,), ``origin`` (3,),
+    ``tcp`` (3,) and ``stays_at`` (6,) as for :func:`level_kernel.moved`; ``staying`` (6, 6): how far a mount moves that
+    stays; (0, 6) where the fits contain that.
+    """
+
+    cases: Cases
+    which: NDArray[np.intp]
+    begun: Separation
+    lever: Array
+    by_motion: Array
+    travel: Array
+    origin: Array
+    tcp: Array
+    stays_at: Array
+    staying: Array
+
+    @property
+    def prior(self) -> Array:
+        """(r,)"""
+        return self.cases.prior
+
+    def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
+        """Into a table, see :func:`level_kernel.moved`."""
+        _, prior, rows, fits, away, more, *_ = self.cases
+        since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
+        of = *fits, rows, prior, away, more, self.which, *self.begun, *since
+        level_kernel.moved(*of, inflation, share, table, first)
+
+
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """What may be wrong with a published pose: sets of it.
+
+    ``inflation``: factor on standard deviations with which a normal distribution bounds the tails of real errors.
+    """
+
+    sets: tuple[Cases | Moved, ...]
+    inflation: float
+
+    @property
+    def count(self) -> int:
+        """Number of all cases."""
+        return sum(len(each.prior) for each in self.sets)
 
     def levels(self, risk: float) -> tuple[float, float, str]:
         """Protection levels of position and of rotation, and the name of what the position's owes most to.
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        squares, spacing, guide, step = QUANTILES
-        position, rotation, number = kernel.levels(
-            self.prior, self.away, *self.tails, risk, LEVEL_TOLERANCE_RATIO, squares, spacing, guide, step
+        table, first = np.empty((7, self.count)), 0
+        if not table.size:
+            return 0.0, 0.0, ""
+        share = risk / table.shape[1]
+        for each in self.sets:
+            each.fill(table, first, share, self.inflation)
+            first += len(each.prior)
+        position, rotation, number = level_kernel.levels(
+            table[0], table[1:3], table[3:5], table[5:7], risk, LEVEL_TOLERANCE_RATIO, *QUANTILES
         )
-        return position, rotation, self.name[number] if number >= 0 else ""
+        return position, rotation, self._name(number)
+
+    def _name(self, number: int) -> str:
+        for each in self.sets if number >= 0 else ():
+            if number < len(each.prior):
+                return (each.cases if isinstance(each, Moved) else each).name[number]
+            number -= len(each.prior)
+        return ""
 
 
 def warm_up() -> None:
     """Compile what a frame needs, or load what was compiled."""
-    whole, none = np.ones((2, 2)), np.zeros(6)
+    whole, none, edge = np.ones((2, 2)), np.zeros(6), np.zeros(2, dtype=np.intp)
+    some, yes, here = np.full(2, 0.1), np.ones(2, dtype=np.bool_), np.eye(4)
     for m in (6, 7):
-        each = np.tile(np.eye(m), (2, 1, 1))
-        model = np.zeros((2, 2, m)), np.zeros((2, 2), dtype=np.intp), 1
-        of = np.zeros((2, m)), each, each, model, whole, each, np.zeros((2, m))
-        fits = Sums.of_kept(*of).fits()
-        with_and_without(*of, none, np.eye(6), fits.of_model[0], 1.0)
+        each, row = np.tile(np.eye(m), (2, 1, 1)), np.zeros((2, m))
+        normal, known = (row, each, each, row, edge), (here, np.eye(6), np.zeros((1, 6)))
+        of = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
+        _, at, fits, _, _ = refitted(*of, 1.0)
     averages, _ = follow(fits, fits, none)
-    with_known(of_motion(fits, fits, np.arange(2), np.eye(6), np.eye(6), np.eye(6)), none, np.eye(6))
-    some, yes = np.full(2, 0.1), np.ones(2, dtype=np.bool_)
-    knocked(fits, none, np.eye(6), fits.of_model[0], Knocks.of(none[:3]), some, some, yes, yes, 1e-9, 1.0)
-    told = telling(averages, none, none, fits, np.arange(2), 1.0)
-    Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)
+    before = at, np.eye(6), fits.of_model[0]
+    knocks = Knocks.of(none[:3])
+    found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
+    after_knocks(fits, before, knocks, found, 0.0)
+    told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))
+    motion = begun(fits, np.eye(6), np.eye(6), np.eye(6))
+    cases = Cases.of(("", ""), np.ones(2), told)
+    since = Moved(cases, edge, motion, np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6))
+    Doubts((cases, since), 1.0).levels(1e-5)

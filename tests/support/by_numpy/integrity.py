@@ -1,11 +1,13 @@
-"""What ``track.integrity.kernel`` compiles, function by function, by NumPy."""
+"""What ``track.integrity.kernel`` and ``level_kernel`` compile, function by function, by NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
+from gripmon.track.integrity.level_kernel import MOST_SIGMAS
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
 
@@ -124,9 +126,12 @@ def after_jumps(
     jumps: Array,
     fit: Ints,
     jump: Ints,
+    probability: Array,
+    share: float,
 ) -> tuple[Array, Array, Array]:
-    before, count = known + jumps[jump], len(fit)
-    return joined(np.tile(at, (count, 1)), before, known_off, shift[fit], covariance[fit], off[fit])
+    before, count, counts = known + jumps[jump], len(fit), probability > share
+    made = joined(np.tile(at, (count, 1)), before, known_off, shift[fit], covariance[fit], off[fit])
+    return made[0] * counts[:, None], made[1] * counts[:, None, None], made[2] * counts[:, None, None]
 
 
 def knocked(
@@ -145,14 +150,13 @@ def knocked(
     endless: Array,
     least: float,
     times: float,
-) -> tuple[Ints, Array, float, Array, Array, Array]:
+) -> tuple[Ints, Ints, Array, float]:
     before = np.outer(probable, share)
     given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
     weight = prior[:, None] * np.where(np.outer(endless, along), np.maximum(given, before), given)
     counts = weight > least
     fit, jump = np.nonzero(counts)
-    poses = after_jumps(shift, covariance, off, at, known, known_off, jumps, fit, jump)
-    return fit, weight[counts], float(weight[~counts].sum()), *poses
+    return fit, jump, weight[counts], float(weight[~counts].sum())
 
 
 def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
@@ -206,22 +210,114 @@ def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Ar
     return joined(shift, covariance, off, every * at, every[:, None] * known, np.zeros_like(off))
 
 
-def of_motion(
+def doubted(
     shift: Array,
     covariance: Array,
     off: Array,
-    first: Ints,
-    first_shift: Array,
-    first_covariance: Array,
-    first_off: Array,
-    lever: Array,
-    turn: Array,
+    rows: Ints,
+    prior: Array,
+    away: Array,
     more: Array,
+    alike: Array,
+    farther: Array,
+    inflation: float,
+    share: float,
+    table: Array,
+    first: int,
+) -> None:
+    every = np.broadcast_to(alike, (len(rows), *alike.shape))
+    fits = shift[rows] - away, covariance[rows] + more, np.concatenate([off[rows], every], axis=1)
+    enter(table, first, prior, share, tails(*fits, inflation), farther)
+
+
+def enter(
+    table: Array, first: int, prior: Array, share: float, of: tuple[Array, Array, Array], farther: Array
+) -> None:
+    columns = table[:, first : first + len(prior)]
+    made = np.concatenate([prior[None], of[0] + farther[:, None], *of[1:]])
+    columns[:] = np.where(np.arange(7)[:, None] == 0, made, np.where(prior > share, made, np.nan))
+
+
+def begun(
+    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
 ) -> tuple[Array, Array, Array]:
-    shift = shift - first_shift[first] @ turn.T
-    covariance = covariance + turn @ first_covariance[first] @ turn.T + more
-    off = off - first_off[first] @ turn.T
-    return shift @ lever.T, lever @ covariance @ lever.T, off @ lever.T
+    turned = lever @ turn
+    return shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
+
+
+def moved(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    rows: Ints,
+    prior: Array,
+    away: Array,
+    more: Array,
+    which: Ints,
+    from_shift: Array,
+    from_covariance: Array,
+    from_off: Array,
+    lever: Array,
+    by_motion: Array,
+    travel: Array,
+    origin: Array,
+    tcp: Array,
+    stays_at: Array,
+    staying: Array,
+    inflation: float,
+    share: float,
+    table: Array,
+    first: int,
+) -> None:
+    way = (shift[rows] - away) @ lever.T - from_shift[which]
+    spread = lever @ (covariance[rows] + more) @ lever.T + from_covariance[which]
+    errors = [off[rows] @ lever.T - from_off[which]]
+    if len(by_motion):
+        # Each by the motion that it has: a file's error does nothing where the mount stayed.
+        ways = origin + way[:, :3] - np.cross(way[:, 3:], tcp)
+        each = np.moveaxis(by_motion @ ways.T, 2, 0)
+        # Such an error is in the motion as published, too, which they are reckoned from.
+        at_origin = each[..., :3] - np.cross(each[..., 3:], tcp)
+        second = MOST_SIGMAS * np.einsum("kij,hlj->hkli", by_motion, at_origin).reshape(len(each), -1, 6)
+        each[:, 0] += travel
+        errors += [second, each]
+    fits = way, spread, np.concatenate(errors, axis=1)
+    if len(staying):
+        fits = with_known(*fits, stays_at, staying)
+    enter(table, first, prior, share, tails(*fits, inflation), np.zeros(2))
+
+
+def refitted(
+    predicted_T: Array,
+    xi: Array,
+    pull: Array,
+    information: Array,
+    middle: Array,
+    lasting: Array,
+    edge: Ints,
+    finger: Ints,
+    fingers: int,
+    longer: Array,
+    keep: Array,
+    opening: Array,
+    vague: Array,
+    way_m: float,
+    sigma_m: float,
+    anchor_T: Array,
+    known: Array,
+    known_off: Array,
+    times: float,
+    together: bool,
+) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...], Array]:
+    fit_T, (count, m) = perturb(predicted_T, xi[:6]), (len(keep), len(xi))
+    held, held_pull = np.tile(np.diag(vague), (count, 1, 1)), np.zeros((count, m))
+    if m == 7:
+        held[~opening, 6, 6] = max(sigma_m, 1e-6) ** -2
+        held_pull[:, 6] = held[:, 6, 6] * way_m
+    model = np.stack([information[:, :, :3] @ (fit_T[:3, :3] @ longer), lasting])
+    part, at = np.stack([finger[edge], fingers + edge]), perturbation_between(fit_T, anchor_T)
+    of = pull, information, middle, model, part, fingers + len(finger), keep, held, held_pull
+    return fit_T, at, *with_and_without(*of, at, known, known_off, times, together)
 
 
 def telling(

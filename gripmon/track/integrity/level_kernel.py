@@ -1,0 +1,374 @@
+"""The arithmetic of protection levels, compiled: how far off a pose may be under each of r hypotheses, or the motion
+since the reference, and the root of the sum over the hypotheses' tails.
+
+h fits, f parts of the gripper, g lasting hypotheses; lengths in m and rad.  What they are for stands in
+:mod:`~gripmon.track.integrity.separation`.  Tests hold each against the function of its name in
+``tests/support/by_numpy/integrity.py``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+from gripmon.track.integrity.kernel import Ints, join
+
+MOST_SIGMAS = 2.0
+"""Standard deviations by which what is of second order is off at most: a plane's tilt is known to 15 degrees, and
+fingers that are tilted by 30 degrees more, or less, point across the view, or at the camera.
+"""
+
+
+
+
+@compiled
+def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
+    """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
+
+    The eigenvalues of B = (C - q) / p, with p so that B has the determinant 2 r and the squares 6, are
+    2 cos(phi + 2 pi k / 3), cos(3 phi) = r (Smith 1961); the product of the largest one's distances to the others is
+    3 (x² - 1), the derivative of the characteristic polynomial.
+    """
+    q = (xx + yy + zz) / 3.0
+    a, b, c = xx - q, yy - q, zz - q
+    p = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    x = 0.0
+    if p > 0.0:
+        a, b, c, d, e, f = a / p, b / p, c / p, xy / p, xz / p, yz / p
+        half_determinant = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
+        x = 2.0 * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3.0)
+    largest = max(q + p * x, 1e-300)
+    if q <= 0.0:
+        return math.sqrt(largest), 0.0
+    left = min(max(3.0 * (p / largest) ** 2 * (x * x - 1.0), 1e-24), 1.0)
+    return math.sqrt(largest), -0.5 * math.log10(left)
+
+
+@compiled
+def _enter(
+    shift: Array, covariance: Array, off: Array, alike: Array, inflation: float, table: Array, number: int
+) -> None:
+    """Into the column ``number`` of a ``table`` (7, n), from its second row on: lengths of a ``shift`` (6,), in
+    position and in rotation, and the tails of its error, sigma twice and factor twice, with its ``covariance`` (6, 6)
+    and the errors by the model, ``off`` (f, 6) and ``alike`` (p, 6).
+    """
+    block = np.empty((3, 3))
+    for part in range(2):
+        first, total = 3 * part, 0.0
+        for i in range(3):
+            total += shift[first + i] ** 2
+            for j in range(i + 1):
+                block[i, j] = inflation**2 * covariance[first + i, first + j]
+        for error in (off, alike):
+            for f in range(len(error)):
+                for i in range(3):
+                    for j in range(i + 1):
+                        block[i, j] += error[f, first + i] * error[f, first + j]
+        table[1 + part, number] = math.sqrt(total)
+        table[3 + part, number], table[5 + part, number] = _tail(
+            block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
+        )
+
+
+@compiled
+def doubted(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    rows: Ints,
+    prior: Array,
+    away: Array,
+    more: Array,
+    alike: Array,
+    farther: Array,
+    inflation: float,
+    share: float,
+    table: Array,
+    first: int,
+) -> None:
+    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of the fits ``rows`` (r,), and, where it is
+    more than a ``share``, how far they are from the pose ``away`` (6,), position and rotation, each ``farther`` (2,),
+    and the tails of their errors: sigma twice and factor twice.
+
+    ``shift`` (h, 6), ``covariance`` (h, 6, 6), to which ``more`` (6, 6) is added, and errors by the model ``off``
+    (h, f, 6), with those that all have, ``alike`` (p, 6).
+    """
+    apart, spread = np.empty(6), np.empty((6, 6))
+    for r in range(len(rows)):
+        h, number = rows[r], first + r
+        table[0, number] = prior[r]
+        if prior[r] <= share:
+            continue
+        for i in range(6):
+            apart[i] = shift[h, i] - away[i]
+            for j in range(6):
+                spread[i, j] = covariance[h, i, j] + more[i, j]
+        _enter(apart, spread, off[h], alike, inflation, table, number)
+        for part in range(2):
+            table[1 + part, number] += farther[part]
+
+
+@compiled
+def _radius(log_risk: float, factor: float, squares: Array, spacing: float) -> float:
+    """Length over sigma that is exceeded with a probability (power of ten)."""
+    last = squares.shape[1] - 1
+    out = math.inf
+    for table in range(2):
+        place = -(log_risk - factor if table == 0 else log_risk) / spacing
+        if place >= last:
+            value = squares[table, last]
+        elif place <= 0.0:
+            value = squares[table, 0]
+        else:
+            k = int(place)
+            value = squares[table, k] + (place - k) * (squares[table, k + 1] - squares[table, k])
+        out = min(out, value)
+    return math.sqrt(out)
+
+
+@compiled
+def _beyond(square: float, factor: float, squares: Array, spacing: float, guide: Ints, step: float) -> float:
+    """Probability of a normalised square: ``guide`` (2, n) is where to begin in the table for each ``step``."""
+    last = squares.shape[1] - 1
+    out = 0.0
+    for table in range(2):
+        place = float(last)
+        if square < squares[table, last]:
+            k = guide[table, int(square / step)]
+            while squares[table, k + 1] <= square:
+                k += 1
+            place = k + (square - squares[table, k]) / (squares[table, k + 1] - squares[table, k])
+        log_tail = -spacing * place
+        out = min(out, log_tail + factor) if table == 0 else min(out, log_tail)
+    return math.exp(out * math.log(10.0))
+
+
+@compiled
+def levels(
+    prior: Array,
+    away: Array,
+    sigma: Array,
+    factor: Array,
+    risk: float,
+    near: float,
+    squares: Array,
+    spacing: float,
+    guide: Ints,
+    step: float,
+) -> tuple[float, float, int]:
+    """Protection levels of position and of rotation, m and rad, and the number of the hypothesis that the position's
+    owes most to; -1 where all together are less probable than the risk.
+
+    The levels are where the sum over the hypotheses of ``prior`` (h,) times the tail beyond level - ``away`` (2, h) is
+    ``risk``, found between bounds by halving their ratio's logarithm down to a factor ``near``; the larger end counts.
+    Those of less than an equal share of the risk take their ``prior`` off it.  ``squares`` to ``step``: the tables of
+    :mod:`~gripmon.track.integrity.quantiles`.
+    """
+    share, left, count = risk / len(prior), risk, 0
+    for h in range(len(prior)):
+        if prior[h] > share:
+            count += 1
+        else:
+            left -= prior[h]
+    if not count:
+        return 0.0, 0.0, -1
+    least, most = np.zeros(2), np.zeros(2)
+    for h in range(len(prior)):
+        if prior[h] <= share:
+            continue
+        alone = math.log10(max(left / prior[h], 1e-300))
+        equally = math.log10(max(left / count / prior[h], 1e-300))
+        for part in range(2):
+            s, f = sigma[part, h], factor[part, h]
+            if alone < 0.0:  # what is less probable than the risk may lie beyond the level altogether
+                least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
+            most[part] = max(most[part], away[part, h] + s * _radius(equally, f, squares, spacing))
+    # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
+    for part in range(2):
+        least[part] = max(least[part], 1e-3 * most[part])
+    while most[0] > near * least[0] or most[1] > near * least[1]:
+        for part in range(2):
+            middle = math.sqrt(least[part] * most[part])
+            total = 0.0
+            for h in range(len(prior)):
+                if prior[h] > share:
+                    length = max(middle - away[part, h], 0.0) / sigma[part, h]
+                    total += prior[h] * _beyond(length * length, factor[part, h], squares, spacing, guide, step)
+                    if total > left:
+                        break
+            if total <= left:
+                most[part] = middle
+            else:
+                least[part] = middle
+    largest, owed = -1.0, -1
+    for h in range(len(prior)):
+        if prior[h] > share:
+            length = max(most[0] - away[0, h], 0.0) / sigma[0, h]
+            part_of_it = prior[h] * _beyond(length * length, factor[0, h], squares, spacing, guide, step)
+            if part_of_it > largest:
+                largest, owed = part_of_it, h
+    return most[0], most[1], owed
+
+
+@compiled
+def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> None:
+    """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
+    for i in range(6):
+        for j in range(6):
+            half[i, j] = 0.0
+            for k in range(6):
+                half[i, j] += jacobian[i, k] * covariance[k, j]
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(6):
+                total += half[i, k] * jacobian[j, k]
+            out[i, j] += total
+            if j < i:
+                out[j, i] += total
+
+
+@compiled
+def begun(
+    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
+) -> tuple[Array, Array, Array]:
+    """What g fits b at the reference, ``shift`` (g, 6), ``covariance`` C (g, 6, 6) and errors by the model ``off``
+    (g, f, 6), take from a motion since: L T of the shifts and of the errors, and the covariances L (T C T' + M) L',
+    with the Jacobians ``lever`` L and ``turn`` T and M = ``more`` (6, 6).
+    """
+    count, turned = len(shift), lever @ turn
+    half, besides = np.empty((6, 6)), np.zeros((6, 6))
+    shifts, covariances, offs = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros(off.shape)
+    _seen_from(more, lever, half, besides)
+    for g in range(count):
+        _seen_from(covariance[g], turned, half, covariances[g])
+        for i in range(6):
+            for k in range(6):
+                covariances[g, i, k] += besides[i, k]
+                shifts[g, i] += turned[i, k] * shift[g, k]
+        for f in range(off.shape[1]):
+            if off[g, f].any():  # most edges of a gripper are seen in no frame
+                for i in range(6):
+                    for k in range(6):
+                        offs[g, f, i] += turned[i, k] * off[g, f, k]
+    return shifts, covariances, offs
+
+
+@compiled
+def _by_motion(by_motion: Array, travel: Array, moved: Array, at: Array, shift: Array, out: Array) -> None:
+    """``out`` (k² + k, 6): errors by a motion of which k directions make ``by_motion`` (k, 6, 3) each, of the second
+    order and of the first, with that of the jaws' ``travel`` (6,).  Each by the motion that a fit has, ``shift`` (6,)
+    from one of the camera's origin by ``moved`` (3,) with the TCP ``at`` (3,): such an error is in the motion as
+    published, too, which fits are reckoned from.
+    """
+    count, way = len(by_motion), np.empty(3)
+    for k in range(count + 1):
+        # By what moves the origin: the fit itself, and then its errors.
+        error = shift if k == 0 else out[count * count + k - 1]
+        for j in range(3):
+            a, b = (j + 1) % 3, (j + 2) % 3
+            way[j] = (moved[j] if k == 0 else 0.0) + error[j] - (error[3 + a] * at[b] - error[3 + b] * at[a])
+        for m in range(count):
+            row = count * count + m if k == 0 else m * count + k - 1
+            for i in range(6):
+                out[row, i] = 0.0
+                for j in range(3):
+                    out[row, i] += by_motion[m, i, j] * way[j]
+                if k > 0:
+                    out[row, i] *= MOST_SIGMAS
+    if count:
+        for i in range(6):
+            out[count * count, i] += travel[i]
+
+
+@compiled
+def _levered(covariance: Array, lever: Array, out: Array) -> None:
+    """``out`` = L C L', each (6, 6), of a ``lever`` L that is one but for the positions by the rotation."""
+    half = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            half[i, j] = covariance[i, j]
+            if i < 3:
+                for k in range(3, 6):
+                    half[i, j] += lever[i, k] * covariance[k, j]
+    for i in range(6):
+        for j in range(i + 1):
+            total = half[i, j]
+            if j < 3:
+                for k in range(3, 6):
+                    total += half[i, k] * lever[j, k]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def moved(
+    shift: Array,
+    covariance: Array,
+    off: Array,
+    rows: Ints,
+    prior: Array,
+    away: Array,
+    more: Array,
+    which: Ints,
+    from_shift: Array,
+    from_covariance: Array,
+    from_off: Array,
+    lever: Array,
+    by_motion: Array,
+    travel: Array,
+    origin: Array,
+    tcp: Array,
+    stays_at: Array,
+    staying: Array,
+    inflation: float,
+    share: float,
+    table: Array,
+    first: int,
+) -> None:
+    """As :func:`doubted`, of the motion since the reference: the differences L (x - T b) of the fits x and those at the
+    reference that are their ``which`` (r,) of g, as :func:`begun` has them, ``from_shift`` (g, 6), ``from_covariance``
+    (g, 6, 6) and ``from_off`` (g, f, 6); L is ``lever`` (6, 6), one but for the positions by the rotation.  The others
+    as for :func:`_by_motion`, ``origin`` (3,) the way of the camera's origin.
+
+    ``staying`` (6, 6): covariance of a motion from ``stays_at`` (6,) that is known besides, :func:`join`; (0, 6): none.
+    """
+    parts, kinds = off.shape[1], len(by_motion)
+    errors = parts + kinds * kinds + kinds
+    apart, spread, half, none = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.zeros((0, 6))
+    way, scatter, error = np.empty(6), np.empty((6, 6)), np.empty((errors, 6))
+    joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((5, 6, 6))
+    exact = np.zeros((errors, 6))
+    before = -1
+    for r in range(len(rows)):
+        h, g, number = rows[r], which[r], first + r
+        table[0, number] = prior[r]
+        if prior[r] <= share:
+            continue
+        if h != before:
+            for i in range(6):
+                apart[i] = shift[h, i] - away[i]
+                for j in range(6):
+                    spread[i, j] = covariance[h, i, j] + more[i, j]
+            _levered(spread, lever, half)
+            before = h
+        for i in range(6):
+            way[i] = -from_shift[g, i] + apart[i]
+            for k in range(3, 6):
+                if i < 3:
+                    way[i] += lever[i, k] * apart[k]
+            for j in range(6):
+                scatter[i, j] = half[i, j] + from_covariance[g, i, j]
+            for f in range(parts):
+                error[f, i] = -from_off[g, f, i] + off[h, f, i]
+                if i < 3:
+                    for k in range(3, 6):
+                        error[f, i] += lever[i, k] * off[h, f, k]
+        _by_motion(by_motion, travel, origin, tcp, way, error[parts:])
+        if len(staying):
+            join(way, scatter, error, (stays_at, staying, exact), joined, work)
+            _enter(joined[0], joined[1], joined[2], none, inflation, table, number)
+        else:
+            _enter(way, scatter, error, none, inflation, table, number)
