@@ -9,7 +9,7 @@ import pytest
 from support.by_numpy import integrity as by_numpy
 
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.model.geometry import perturb, skew
+from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
 from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario
@@ -122,9 +122,10 @@ def tables(rng: np.random.Generator, kinds: int, staying: bool) -> tuple[np.ndar
     """(7, n) each, compiled and NumPy's, of some fits of a pose and some of the motion since."""
     frame, first, away = fits(rng), fits(rng), shifts(rng, 1)[0]
     rows, prior = rng.integers(0, HYPOTHESES, 9), 10.0 ** rng.uniform(-4.0, 0.0, 9)
-    lever, turn = np.eye(6), np.eye(6)
-    lever[:3, 3:] = -skew(0.01 * rng.normal(size=3))
-    turn[:3, :3] = turn[3:, 3:] = AT_T[:3, :3]
+    poses = [perturb(AT_T, 10.0 * xi) for xi in shifts(rng, 3)]
+    lever, turn, *_ = made = level_kernel.motion_since(*poses)
+    for one, other in zip(made, by_numpy.motion_since(*poses), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-14)
     since = first.shift, first.covariance, first.of_model, lever, turn, covariances(rng, 1)[0]
     agree(level_kernel.begun(*since), by_numpy.begun(*since))
     of = *frame, rows, prior, away, 0.1 * covariances(rng, 1)[0]

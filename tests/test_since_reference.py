@@ -423,7 +423,7 @@ def test_a_knock_is_a_change_for_the_state_file_once(monkeypatch: pytest.MonkeyP
         monitor.process(simulator.frame(index))
         monitor.run_pending()
         changes.append(monitor._trust.since.changes)
-    assert monitor._trust.since.knocked
+    assert monitor._trust.since.current.knocked
     assert changes[KNOCKED - 1] < changes[KNOCKED + 5] == changes[-1]
 
 
@@ -432,11 +432,11 @@ def test_that_a_mount_stays_is_known_less_the_longer_ago_the_reference_is(days: 
     kept = begun()
     kept.add(Mean(np.eye(4)), 0.03, 10**9)
     kept.now_ns = 10**9 + int(days * 86_400e9)
-    assert kept.elapsed_s == days * 86_400.0 and not kept.knocked
+    assert kept.elapsed_s == days * 86_400.0 and not kept.current.knocked
     kept.now_ns = 0
     assert kept.elapsed_s == 0.0, "a clock that was set back"
     kept.moved()
-    assert kept.knocked
+    assert kept.current.knocked
 
 
 def test_the_configured_reference_the_one_in_force_and_the_newest_are_kept():

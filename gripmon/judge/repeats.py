@@ -41,6 +41,7 @@ class RepeatWatch:
         self._slot = 0
         self._new_s = np.full(edges, -np.inf)
         self._fault: StreamFault | None = None
+        self._white: dict[np.dtype[Any], int] = {}  # as an unsigned number
 
     def taken(self) -> StreamFault | None:
         """What there is to say of the newest measured frame where it has lasted, once: a frame in which nothing is
@@ -62,11 +63,15 @@ class RepeatWatch:
         pixels = np.ascontiguousarray(image).view(np.uint8).reshape(rows, -1)
         pixels.flags.writeable = False
         prediction, candidates = measurement.prediction, measurement.candidates
+        white = self._white.get(image.dtype)
+        if white is None:
+            white = int(np.array(FULL_SCALE[image.dtype], image.dtype).view(f"u{image.itemsize}"))
+            self._white[image.dtype] = white
         new, old = repeated_edges(
             pixels,
             image.itemsize,
             pixels.shape[1] // columns,
-            int(np.array(FULL_SCALE[image.dtype], image.dtype).view(f"u{image.itemsize}")),
+            white,
             prediction.uv_px,
             prediction.normal,
             candidates.sample,

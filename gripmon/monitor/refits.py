@@ -92,6 +92,10 @@ class Refits:
         self.of_model = made.alone.of_model
         """(h, f, 6) their errors if a finger is longer by its standard deviation."""
 
+    def under(self, hypotheses: Hypotheses) -> Refits:
+        """The fits by the frame alone under other hypotheses."""
+        return Refits(self._measurement, hypotheses, self._floor, self.model, self.known, together=False)
+
     @property
     def edges(self) -> NDArray[np.intp]:
         """(v,) edges that the fits are made of."""
@@ -110,17 +114,12 @@ class Refits:
         """(6,) where a published pose (4, 4) is from the one that the fits count from."""
         return perturbation_between(self._fit_T, cam_T_grip)
 
-    def cases(
-        self, away: Array, prior: Array, chosen: NDArray[np.bool_], anchored: Anchored | None = None
-    ) -> Cases:
+    def cases(self, away: Array, prior: Array, chosen: NDArray[np.bool_], anchored: Anchored | None = None) -> Cases:
         """What may be wrong with a published pose, :meth:`away`, under the ``chosen`` hypotheses (h,) of probability
         ``prior`` (h,), by the frame alone or by the anchor too.
         """
         fits, rows = self._free if anchored is None else anchored.fits, np.flatnonzero(chosen)
-        name = self.hypotheses.name
-        if len(rows) < len(name):
-            name = tuple(name[k] for k in rows.tolist())
-        return Cases(name, prior[rows], rows, fits, away, self._floor)
+        return Cases(prior[rows], self.hypotheses.name, rows, rows, fits, away, self._floor)
 
     def knocked(self, prior: Array, knocks: Knocks, odds: tuple[float, float], least: float) -> Knocked:
         """That the mount was knocked since the pose that is known.
@@ -138,17 +137,17 @@ class Refits:
         """What may be wrong with a published pose, :meth:`away`, after such a knock; of no more probable ones than a
         ``share`` the prior alone counts.
         """
-        name = tuple(self.hypotheses.name[k] for k in of.fit.tolist())
-        fits = after_knocks(self._free, self._known, knocks, of, share)
-        return Cases(name, of.prior, np.arange(len(name)), fits, away, self._floor)
+        fits, every = after_knocks(self._free, self._known, knocks, of, share), np.arange(len(of.prior))
+        return Cases(of.prior, self.hypotheses.name, of.fit, every, fits, away, self._floor)
 
     def wrong_at_first(self, lasting: tuple[str, ...], prior: Array, away: Array, anchored: Anchored | None) -> Cases:
         """Of the motion since the reference's frames: one of the lasting hypotheses but the first, by name and of a
         ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the published pose, :meth:`away`,
         rests on the frame alone.
         """
-        fits, first = self._free if anchored is None else anchored.fits, np.zeros(len(lasting) - 1, dtype=np.intp)
-        return Cases(_in_the_references_frames(lasting), prior[1:], first, fits, away, self._floor)
+        fits, every = self._free if anchored is None else anchored.fits, np.arange(len(lasting) - 1)
+        name = _in_the_references_frames(lasting)
+        return Cases(prior[1:], name, every, np.zeros_like(every), fits, away, self._floor)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

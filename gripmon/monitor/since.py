@@ -38,7 +38,7 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.common import CommonError
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Cases, Moved, Separation, begun
+from gripmon.track.integrity import Cases, Moved, Separation, begun, motion_since
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -135,7 +135,7 @@ class Differences(NamedTuple):
         contain that.
         """
         which = np.zeros(len(cases.prior), dtype=np.intp) if lasting is None else lasting
-        return Moved(cases, which, *self, np.zeros((0, 6)) if staying is None else staying)
+        return Moved(cases.prior, cases, which, *self, np.zeros((0, 6)) if staying is None else staying)
 
 
 class AtReference(NamedTuple):
@@ -161,7 +161,7 @@ class AtReference(NamedTuple):
 
     def covariance_of(self, covariance: Array, cam_T_grip: Array, reference_T: Array) -> Array:
         """(6, 6) of exp(d) reference, of a measured pose (4, 4) with a ``covariance`` (6, 6)."""
-        lever, turn = self._jacobians(cam_T_grip, reference_T)
+        lever, turn, *_ = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
         return np.asarray(lever @ (covariance + turn @ self.fits.covariance[0] @ turn.T) @ lever.T)
 
     def differences(
@@ -170,8 +170,7 @@ class AtReference(NamedTuple):
         """How fits near a published pose (4, 4) differ from that of exp(d) reference; ``swing`` (6,): variances by
         which a mount that vibrates differs from its average.
         """
-        lever, turn = self._jacobians(cam_T_grip, reference_T)
-        motion = self.motion(cam_T_grip)
+        lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
         more, travel, by_motion = np.diag(swing), np.zeros(6), np.zeros((0, 6, 3))
         if common is not None:
             travel_m = opened.jaw_opening_m - self.jaw_opening_m
@@ -180,21 +179,8 @@ class AtReference(NamedTuple):
             size = common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0
             travel = size * travel_m * (lever @ opened.pose_rate)
             by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
-        at_T = motion @ reference_T
-        unmoved = perturbation_between(at_T, reference_T)
         first = begun(self.fits, lever, turn, more)
         return Differences(first, lever, by_motion, travel, motion[:3, 3].copy(), at_T[:3, 3].copy(), unmoved)
-
-    def _jacobians(self, cam_T_grip: Array, reference_T: Array) -> tuple[Array, Array]:
-        """(6, 6) each: ``lever`` from the difference of the errors of x and of b to that of exp(d) reference, which is
-        as far from x_b as the reference is wrong, and ``turn`` of an error of b to camera axes as they are after d.
-        """
-        rotation = cam_T_grip[:3, :3] @ self.cam_T_grip[:3, :3].T
-        turn, lever = np.zeros((6, 6)), np.eye(6)
-        turn[:3, :3] = turn[3:, 3:] = rotation
-        x, y, z = (rotation @ (reference_T[:3, 3] - self.cam_T_grip[:3, 3])).tolist()
-        lever[:3, 3:] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
-        return lever, turn
 
 
 class AtReferences:
@@ -207,6 +193,8 @@ class AtReferences:
         self._valid_by = valid_by
         self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
         self._known: dict[str, AtReference] = {}
+        self.current: AtReference | None = None
+        """At the reference in force; None until a frame proves a pose."""
         self._growing: Average | None = None  # the average that b follows until there are enough frames
         self._risk = risk
         self.changes = 0
@@ -216,25 +204,10 @@ class AtReferences:
         self.refer(reference)
 
     @property
-    def current(self) -> AtReference | None:
-        """At the reference in force; None until a frame proves a pose."""
-        return self._known.get(self._id)
-
-    @property
     def elapsed_s(self) -> float:
         """Time since the reference's frames; of a clock that was set back none."""
         first = self.current
         return 0.0 if first is None else max(1e-9 * (self.now_ns - first.since_ns), 0.0)
-
-    @property
-    def knocked(self) -> bool:
-        """Whether the mount was knocked since then."""
-        return self.current is not None and self.current.knocked
-
-    @property
-    def misread(self) -> float:
-        """Probability that what looked like the fingers' ends in those frames was something else."""
-        return 1.0 if self.current is None else self.current.misread
 
     @property
     def published_by(self) -> tuple[AtReference | None, Array]:
@@ -272,7 +245,7 @@ class AtReferences:
         """Another reference is in force; one that is restored is still known."""
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
-        self._growing = None
+        self._growing, self.current = None, self._known.get(self._id)
         self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
@@ -295,7 +268,8 @@ class AtReferences:
         # A mount that creeps meanwhile stands at the average's place in the middle of its frames.
         since_ns = self._stamps_ns[(len(self._stamps_ns) - 1) // 2]
         at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
-        self._known[self._id] = AtReference(*at, Since.FIRST_PROVED, since_ns, anchor.misread, anchor.proven)
+        self.current = AtReference(*at, Since.FIRST_PROVED, since_ns, anchor.misread, anchor.proven)
+        self._known[self._id] = self.current
         if len(self._openings_m) >= FIRST_FRAMES:
             self._end()
 
@@ -303,11 +277,12 @@ class AtReferences:
         """A frame has proved a pose: what was known of the reference in force without the fingers' ends is dropped."""
         if self.current is not None and not self.current.proven:
             self._known.pop(self._id)
-            self._growing = None
+            self._growing = self.current = None
 
     def moved(self) -> None:
         """The mount was knocked: that it stays where it was says nothing about the motion since any reference."""
         self._known = {name: at._replace(knocked=True) for name, at in self._known.items()}
+        self.current = self._known.get(self._id)
         self.changes += 1
 
     def _was_wrong(self, first: Average, anchor: Average) -> bool:
@@ -328,6 +303,7 @@ class AtReferences:
         while len(self._known) > KEPT_REFERENCES:
             _configured, *others = self._known
             del self._known[next(each for each in others if each != self._id)]
+        self.current = self._known.get(self._id)
 
     def state(self) -> tuple[AtReferenceRecord, ...]:
         """What survives a restart: without an average that is still growing, which begins anew."""
@@ -372,6 +348,7 @@ class AtReferences:
             else:
                 at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns
                 self._known[each.reference_id] = AtReference(*at, each.misread, each.proven, each.knocked)
+        self.current = self._known.get(self._id)
         return refused
 
 

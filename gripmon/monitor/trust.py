@@ -301,7 +301,8 @@ class Integrity:
             self._jaw_opening_m = measurement.jaw_opening_m
             if proves:
                 self.since.proved()
-            if proves and not self.since.knocked and self._weigher.moved():
+            first = self.since.current
+            if proves and first is not None and not first.knocked and self._weigher.moved():
                 self.since.moved()  # once: each change is written to the state file
             self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
         if proves and frame.image is not None and not (moved or trust.may_have_slid):

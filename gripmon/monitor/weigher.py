@@ -7,10 +7,10 @@ knocked, which is rare: the average of the proven poses is the anchor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
@@ -25,12 +25,12 @@ from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, stri
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import AtReferences, Bounds, Differences
+from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, Moved, bounds
+from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
@@ -75,6 +75,8 @@ class Weigher:
         self.anchor: Anchor | None = None
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
+        self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
+        self._axis = tracker.finger_axis
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
@@ -173,19 +175,10 @@ class Weigher:
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
-        without = self._without_ends(measurement, fits, besides, displaced)
+        without = self._without_ends(fits, besides, displaced)
         wrong = self._knocks_under(fits, without, prior, knocks, odds)
-        left_out = sum(found.left_out for _, found in wrong)
-        # And what may have been wrong all along, or in the reference's frames.
-        away, differences = fits.away(cam_T_grip), fits.model.differences(cam_T_grip, fits.opened, self.swing)
-        stayed = fits.cases(away, prior, fits.stays, anchored)
-        ever, told, at_first = self._lasting_cases(fits, away, cam_T_grip, displaced, now_s, differences is not None)
-        count = _count([stayed]) + sum(len(found.prior) for _, found in wrong)
-        count += max(_count(ever), _count([*told, *at_first]))
-        now = [stayed, *(of.after(away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
-        absolute = fits.model.absolute([*now, *ever], cam_T_grip)
-        since = Doubts(tuple(self._of_motion(now, told, at_first, differences, knocks, displaced)), SIGMA_INFLATION)
-        both = Bounds(protection_of(absolute, risk, left_out), protection_of(since, risk, left_out))
+        stayed = fits.cases(fits.away(cam_T_grip), prior, fits.stays, anchored)
+        both = self._bounds(stayed, wrong, fits, cam_T_grip, displaced, now_s, knocks)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = fits if proven or without is None else without
@@ -249,49 +242,64 @@ class Weigher:
             absolute = larger(absolute, self._not_as_expected(self.unexplained))
         return both._replace(absolute=absolute)
 
-    def _lasting_cases(
-        self, fits: Refits, away: Array, cam_T_grip: Array, displaced: bool, now_s: float, since: bool
-    ) -> tuple[list[Cases], list[Cases], list[Cases]]:
-        """What may have been wrong all along with a pose (4, 4), and, by what is known without the anchor's origin,
-        with the motion since the reference; and, if there is a motion ``since`` its frames, in those alone.  None of
-        the first two without an anchor there.
+    def _bounds(
+        self,
+        stayed: Cases,
+        wrong: list[tuple[Refits, Knocked]],
+        fits: Refits,
+        cam_T_grip: Array,
+        displaced: bool,
+        now_s: float,
+        knocks: Knocks,
+    ) -> Bounds:
+        """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
+        is as known, ``stayed``, and after the knocks that are ``wrong``, with what may have been wrong all along, or in
+        the reference's frames alone.
         """
-        anchor, lasting = self.anchor, self._lasting
-        ever, told, at_first = list[Cases](), list[Cases](), list[Cases]()
+        risk, anchor, (first, _) = self._policy.integrity_risk, self.anchor, fits.model.first
+        lasting, every = self._lasting, np.arange(len(self._lasting.name))
+        ever, since = list[Cases](), list[tuple[Cases, NDArray[np.intp]]]()
         if anchor is not None and not displaced:
             rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
             absolute, without_origin = anchor.cases(cam_T_grip, fits, rows, self._wander(now_s), prior)
-            ever, told = [absolute], [without_origin]
-        if since:
-            anchored, prior = None if displaced else fits.anchored, lasting.priors(self._since.misread)
-            at_first = [fits.wrong_at_first(lasting.name, prior, away, anchored)]
-        return ever, told, at_first
+            ever, since = [absolute], [(without_origin, every)]
+        if first is not None:
+            anchored, prior = None if displaced else fits.anchored, lasting.priors(first.misread)
+            since.append((fits.wrong_at_first(lasting.name, prior, stayed.away, anchored), every[1:]))
+        left_out, count = 0.0, len(stayed.prior) + 2 * len(every)
+        for _, found in wrong:
+            left_out, count = left_out + found.left_out, count + len(found.prior)
+        # Of what isn't probable enough to have a bound, whichever, the prior counts alone.
+        now = [stayed, *(of.after(stayed.away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
+        of_motion = self._of_motion(now, since, fits, cam_T_grip, knocks, displaced)
+        absolutely = fits.model.absolute([*now, *ever], cam_T_grip)
+        return Bounds(protection_of(absolutely, risk, left_out), protection_of(of_motion, risk, left_out))
 
     def _of_motion(
         self,
         now: list[Cases],
-        told: list[Cases],
-        at_first: list[Cases],
-        differences: Differences | None,
+        lasting: list[tuple[Cases, NDArray[np.intp]]],
+        fits: Refits,
+        cam_T_grip: Array,
         knocks: Knocks,
         displaced: bool,
-    ) -> Iterator[Cases | Moved]:
-        """What may be wrong with the motion since the reference, of what is wrong ``now``, all along, or ``at_first``
-        alone; without ``differences`` this frame is the first one.
+    ) -> Doubts:
+        """The doubts about the motion since the reference, of what is wrong ``now``, and of what may have been in its
+        frames, with the numbers of the ``lasting`` hypotheses.  Of a mount that vibrates the average of the reference's
+        frames and its place at their stamp differ by that.
         """
-        if differences is None:
-            yield from map(as_uncertain_again, [*now, *told])
-            return
-        yield from map(differences.of, now)
-        staying, every = self._staying(knocks, displaced), np.arange(len(self._lasting.name))
-        yield from (differences.of(each, every, staying) for each in told)
-        yield from (differences.of(each, every[1:], staying) for each in at_first)
+        differences = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+        if differences is None:  # this frame is the first one
+            return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
+        staying = self._staying(knocks, displaced)
+        stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
+        return Doubts((*map(differences.of, now), *stayed), SIGMA_INFLATION)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
         ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
-        axis = cam_T_grip[:3, :3] @ self._tracker.finger_axis
+        axis = cam_T_grip[:3, :3] @ self._axis
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
@@ -300,7 +308,8 @@ class Weigher:
         """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
         vibrates, and after a knock by what a knock moves it.
         """
-        return self._usual_motion + knocks.spread if displaced or self._since.knocked else self._usual_motion
+        moved = displaced or (self._since.current is not None and self._since.current.knocked)
+        return self._usual_motion + knocks.spread if moved else self._usual_motion
 
     @property
     def _usual_motion(self) -> Array:
@@ -318,7 +327,7 @@ class Weigher:
         covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
         return _contradicts(way, covariance)
 
-    def _without_ends(self, measurement: Measurement, fits: Refits, besides: float, displaced: bool) -> Refits | None:
+    def _without_ends(self, fits: Refits, besides: float, displaced: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
         probability ``besides``, doesn't count.
         """
@@ -326,9 +335,7 @@ class Weigher:
             return fits
         if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
             return None
-        hypotheses = self._possible.about(fits.edges).without_ends
-        floor = self._tracker.floor_of(measurement)
-        return Refits(measurement, hypotheses, floor, fits.model, fits.known, together=False)
+        return fits.under(self._possible.about(fits.edges).without_ends)
 
     def _knocks_under(
         self, fits: Refits, without: Refits | None, prior: Array, knocks: Knocks, odds: tuple[float, float]
@@ -344,11 +351,6 @@ class Weigher:
             both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
             found.append((without, without.knocked(both, knocks, odds, self._least)))
         return found
-
-    @property
-    def _least(self) -> float:
-        """Probability below which a knock under a hypothesis isn't solved."""
-        return LEAST_WEIGHT_RATIO * self._policy.integrity_risk
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
@@ -467,10 +469,6 @@ class Weigher:
             floor = self._tracker.floor_of(measurement)
             self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]
-
-
-def _count(sets: list[Cases]) -> int:
-    return sum(len(each.prior) for each in sets)
 
 
 def _contradicts(way: Array, covariance: Array) -> bool:

@@ -159,8 +159,11 @@ def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknown
         for i in range(n):
             for j in range(m):
                 shift[h, i] += inverse[i, j] * sums[h, j]
-                for f in range(fingers):
-                    off[h, f, i] += inverse[i, j] * of_model[h, f, j]
+        for f in range(fingers):
+            if of_model[h, f].any():  # most edges of a gripper are seen in no frame
+                for i in range(n):
+                    for j in range(m):
+                        off[h, f, i] += inverse[i, j] * of_model[h, f, j]
         # U (U' spread U) U': multiplied by N^-1 itself, an open direction takes the digits of all others.
         middle, half = spread[h], root
         if rooted:
@@ -215,9 +218,14 @@ def between(covariance: Array, off: Array, more: Array, other: Array, times: flo
     for i in range(6):
         for j in range(i + 1):
             out[i, j] = times * covariance[i, j] + more[i, j]
-            for f in range(len(off)):
-                g = min(f, len(other) - 1)
-                out[i, j] += (off[f, i] - other[g, i]) * (off[f, j] - other[g, j])
+    for f in range(len(off)):
+        g = min(f, len(other) - 1)
+        if off[f].any() or other[g].any():
+            for i in range(6):
+                for j in range(i + 1):
+                    out[i, j] += (off[f, i] - other[g, i]) * (off[f, j] - other[g, j])
+    for i in range(6):
+        for j in range(i):
             out[j, i] = out[i, j]
 
 
@@ -385,7 +393,12 @@ def join(
             new_covariance[i, j] = new_covariance[j, i] = smaller[i, j] - total
     _blend(mean, shift, share, upper, backward, new_mean)
     for f in range(len(new_off)):
-        _blend(off[min(f, len(off) - 1)], of_model[f], share, upper, backward, new_off[f])
+        before_off = off[min(f, len(off) - 1)]
+        if before_off.any() or of_model[f].any():
+            _blend(before_off, of_model[f], share, upper, backward, new_off[f])
+        else:
+            for i in range(6):
+                new_off[f, i] = 0.0
     return 6.0 - taken if backward else taken
 
 

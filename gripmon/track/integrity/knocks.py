@@ -71,17 +71,21 @@ class Knocks(NamedTuple):
         length = float(np.linalg.norm(axis_cam))
         if length == 0.0:
             return cls(np.array(ANY_SHARE), _ANYWHERE, np.zeros(len(ANY_SHARE), dtype=np.bool_))
-        count = len(ANY_SHARE) + len(ALONG_SHARE)
-        covariance, way = np.zeros((count, 6, 6)), axis_cam / length
-        covariance[: len(ANY_SHARE)] = _ANYWHERE
-        covariance[len(ANY_SHARE) :, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * np.outer(way, way)
-        share = [(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]
-        return cls(np.concatenate(share), covariance, np.arange(count) >= len(ANY_SHARE))
+        covariance, way = _NONE_ALONG.covariance.copy(), axis_cam / length
+        covariance[len(ANY_SHARE) :, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
+        return _NONE_ALONG._replace(covariance=covariance)
 
     @property
     def spread(self) -> Array:
         """(6, 6) covariance of the motion by any knock."""
         return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
+
+
+_NONE_ALONG = Knocks(
+    np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]),
+    np.concatenate([_ANYWHERE, np.zeros((len(ALONG_SHARE), 6, 6))]),
+    np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
+)
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:
@@ -102,15 +106,13 @@ class Mount:
         """
         self._creep, self._jumps_per_s = creep, jumps_per_month / (30.0 * 86_400.0)
         self._swing: Array = np.square(play)
-
-    @property
-    def swing(self) -> Array:
+        self.swing: Array = self._swing
         """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
-        return np.maximum(self._swing, 0.0)
 
     def learn(self, way: Array, noise: Array) -> None:
         """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
         self._swing = swinging(self._swing, way, noise)
+        self.swing = np.maximum(self._swing, 0.0)
 
     def creep(self, elapsed_s: float) -> Array:
         """(6,) variance of the slow motion in a time; a clock that was set back is no time."""

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from gripmon.model.compiled import compiled
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints, join
 
@@ -64,9 +65,13 @@ def _enter(
                 block[i, j] = inflation**2 * covariance[first + i, first + j]
         for error in (off, alike):
             for f in range(len(error)):
-                for i in range(3):
-                    for j in range(i + 1):
-                        block[i, j] += error[f, first + i] * error[f, first + j]
+                a, b, c = error[f, first], error[f, first + 1], error[f, first + 2]
+                block[0, 0] += a * a
+                block[1, 0] += b * a
+                block[1, 1] += b * b
+                block[2, 0] += c * a
+                block[2, 1] += c * b
+                block[2, 2] += c * c
         table[1 + part, number] = math.sqrt(total)
         table[3 + part, number], table[5 + part, number] = _tail(
             block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
@@ -232,6 +237,34 @@ def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> N
 
 
 @compiled
+def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Of a pose x, ``cam_T_grip``, and the one ``first_T`` that it had at the reference, x_b: the Jacobians (6, 6)
+    ``lever`` from the difference of their errors to that of exp(d) reference, which is as far from x_b as the reference
+    is wrong, and ``turn`` of an error of x_b to camera axes as they are after d; the motion exp(d), exp(d) reference,
+    (4, 4) each, and the perturbation (6,) from there back to the reference.
+    """
+    lever, turn, motion, at_T = np.eye(6), np.zeros((6, 6)), np.zeros((4, 4)), np.zeros((4, 4))
+    arm = np.zeros(3)
+    motion[3, 3] = at_T[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                motion[i, j] += cam_T_grip[i, k] * first_T[j, k]
+            turn[i, j] = turn[3 + i, 3 + j] = motion[i, j]
+        motion[i, 3] = at_T[i, 3] = cam_T_grip[i, 3]
+        for k in range(3):
+            motion[i, 3] -= motion[i, k] * first_T[k, 3]
+            arm[i] += motion[i, k] * (reference_T[k, 3] - first_T[k, 3])
+            for j in range(3):
+                at_T[i, j] += motion[i, k] * reference_T[k, j]
+        at_T[i, 3] += arm[i]
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        lever[a, 3 + b], lever[b, 3 + a] = arm[i], -arm[i]
+    return lever, turn, motion, at_T, perturbation_between(at_T, reference_T)
+
+
+@compiled
 def begun(
     shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
 ) -> tuple[Array, Array, Array]:
@@ -361,9 +394,11 @@ def moved(
                     way[i] += lever[i, k] * apart[k]
             for j in range(6):
                 scatter[i, j] = half[i, j] + from_covariance[g, i, j]
-            for f in range(parts):
+        for f in range(parts):
+            for i in range(6):
                 error[f, i] = -from_off[g, f, i] + off[h, f, i]
-                if i < 3:
+            if off[h, f].any():
+                for i in range(3):
                     for k in range(3, 6):
                         error[f, i] += lever[i, k] * off[h, f, k]
         _by_motion(by_motion, travel, origin, tcp, way, error[parts:])

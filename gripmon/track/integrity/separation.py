@@ -150,6 +150,11 @@ def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
     return Separation(*kernel.with_known(*fits, at, covariance))
 
 
+def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """See :func:`level_kernel.motion_since`."""
+    return level_kernel.motion_since(cam_T_grip, first_T, reference_T)
+
+
 def begun(first: Separation, lever: Array, turn: Array, more: Array) -> Separation:
     """What the fits ``first`` at the reference take from a motion since, see :func:`level_kernel.begun`."""
     return Separation(*level_kernel.begun(*first, lever, turn, more))
@@ -248,14 +253,16 @@ def bounds(covariance: Array, risk: Array) -> Array:
 
 
 class Cases(NamedTuple):
-    """Things that may be wrong with a published pose, r of them: ``name``, ``prior`` (r,), and which ``rows`` (r,) of
-    the ``fits`` is the one under each.  The fits count from a pose that the published one is ``away`` (6,) from, and
-    the covariance ``more`` (6, 6) comes on top.  ``alike`` (p, 6): errors by the model that all have, by their standard
-    deviations; ``farther`` (2,): what is added to their distances, m and rad.
+    """Things that may be wrong with a published pose, r of them: the ``name`` that each is ``called`` (r,) by, its
+    ``prior`` (r,), and which ``rows`` (r,) of the ``fits`` is the one under it.  The fits count from a pose that the
+    published one is ``away`` (6,) from, and the covariance ``more`` (6, 6) comes on top.  ``alike`` (p, 6): errors by
+    the model that all have, by their standard deviations; ``farther`` (2,): what is added to their distances, m and
+    rad.
     """
 
-    name: tuple[str, ...]
     prior: Array
+    name: tuple[str, ...]
+    called: NDArray[np.intp]
     rows: NDArray[np.intp]
     fits: Separation
     away: Array
@@ -266,7 +273,8 @@ class Cases(NamedTuple):
     @classmethod
     def of(cls, name: tuple[str, ...], prior: Array, fits: Separation) -> Cases:
         """``fits`` with shifts (h, 6) from the published pose."""
-        return cls(name, prior, np.arange(len(prior)), fits, np.zeros(6))
+        every = np.arange(len(prior))
+        return cls(prior, name, every, every, fits, np.zeros(6))
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.doubted`."""
@@ -275,12 +283,13 @@ class Cases(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """The same about the motion since the reference, where fits ``begun`` under g hypotheses; ``which`` (r,) of them
-    each of the ``cases`` goes with.  ``lever`` (6, 6), ``by_motion`` (k, 6, 3), ``travel`` (6,), ``origin`` (3,),
-    ``tcp`` (3,) and ``stays_at`` (6,) as for :func:`level_kernel.moved`; ``staying`` (6, 6): how far a mount moves that
-    stays; (0, 6) where the fits contain that.
+    """The same about the motion since the reference: fits have ``begun`` there under g hypotheses, of which each of the
+    ``cases``, with their ``prior`` (r,), goes with its own, ``which`` (r,).  ``lever`` (6, 6), ``by_motion`` (k, 6, 3),
+    ``travel`` (6,), ``origin`` (3,), ``tcp`` (3,) and ``stays_at`` (6,) as for :func:`level_kernel.moved`; ``staying``
+    (6, 6): how far a mount moves that stays; (0, 6) where the fits contain that.
     """
 
+    prior: Array
     cases: Cases
     which: NDArray[np.intp]
     begun: Separation
@@ -292,14 +301,9 @@ class Moved(NamedTuple):
     stays_at: Array
     staying: Array
 
-    @property
-    def prior(self) -> Array:
-        """(r,)"""
-        return self.cases.prior
-
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.moved`."""
-        _, prior, rows, fits, away, more, *_ = self.cases
+        prior, _, _, rows, fits, away, more, *_ = self.cases
         since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
         of = *fits, rows, prior, away, more, self.which, *self.begun, *since
         level_kernel.moved(*of, inflation, share, table, first)
@@ -315,34 +319,31 @@ class Doubts:
     sets: tuple[Cases | Moved, ...]
     inflation: float
 
-    @property
-    def count(self) -> int:
-        """Number of all cases."""
-        return sum(len(each.prior) for each in self.sets)
-
     def levels(self, risk: float) -> tuple[float, float, str]:
         """Protection levels of position and of rotation, and the name of what the position's owes most to.
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        table, first = np.empty((7, self.count)), 0
-        if not table.size:
-            return 0.0, 0.0, ""
-        share = risk / table.shape[1]
+        count = 0
         for each in self.sets:
-            each.fill(table, first, share, self.inflation)
+            count += len(each.prior)
+        if not count:
+            return 0.0, 0.0, ""
+        table, first = np.empty((7, count)), 0
+        for each in self.sets:
+            each.fill(table, first, risk / count, self.inflation)
             first += len(each.prior)
         position, rotation, number = level_kernel.levels(
             table[0], table[1:3], table[3:5], table[5:7], risk, LEVEL_TOLERANCE_RATIO, *QUANTILES
         )
-        return position, rotation, self._name(number)
-
-    def _name(self, number: int) -> str:
-        for each in self.sets if number >= 0 else ():
+        if number < 0:
+            return position, rotation, ""
+        for each in self.sets:
             if number < len(each.prior):
-                return (each.cases if isinstance(each, Moved) else each).name[number]
+                break
             number -= len(each.prior)
-        return ""
+        cases = each.cases if isinstance(each, Moved) else each
+        return position, rotation, cases.name[cases.called[number]]
 
 
 def warm_up() -> None:
@@ -352,15 +353,16 @@ def warm_up() -> None:
     for m in (6, 7):
         each, row = np.tile(np.eye(m), (2, 1, 1)), np.zeros((2, m))
         normal, known = (row, each, each, row, edge), (here, np.eye(6), np.zeros((1, 6)))
-        of = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
-        _, at, fits, _, _ = refitted(*of, 1.0)
+        made = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
+        _, at, fits, _, _ = refitted(*made, 1.0)
     averages, _ = follow(fits, fits, none)
     before = at, np.eye(6), fits.of_model[0]
     knocks = Knocks.of(none[:3])
     found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
     after_knocks(fits, before, knocks, found, 0.0)
     told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))
-    motion = begun(fits, np.eye(6), np.eye(6), np.eye(6))
+    motion = begun(fits, *motion_since(here, here, here)[:2], np.eye(6))
     cases = Cases.of(("", ""), np.ones(2), told)
-    since = Moved(cases, edge, motion, np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6))
+    of = np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6)
+    since = Moved(cases.prior, cases, edge, motion, *of)
     Doubts((cases, since), 1.0).levels(1e-5)

@@ -2,7 +2,7 @@
 
 from gripmon.track.look.agreement import LookAgreement
 from gripmon.track.look.core import GripperLook
-from gripmon.track.look.strips import ONE_EDGE_PX, FingerStrips, StripsRefused, StripsSeen
+from gripmon.track.look.strips import ONE_EDGE_PX, FingerStrips, StripsRefused, StripsSeen, warm_up
 
 __all__ = [
     "ONE_EDGE_PX",
@@ -11,4 +11,5 @@ __all__ = [
     "LookAgreement",
     "StripsRefused",
     "StripsSeen",
+    "warm_up",
 ]

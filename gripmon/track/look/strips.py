@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.compiled import compiled
 from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import GREY_BGR
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image, StripsRecord
 
 LENGTH_PX, REACH_PX = 64, 96
@@ -40,6 +42,11 @@ FILTERED_PX = SLOPE_PX // 2 + 1
 
 NODE_PX = 16
 """Between points of a strip that are projected: lenses bend a line by less than a hundredth of a pixel between them."""
+
+KEPT_PX = 1.0
+"""Motion up to which points follow where they were projected, by their Jacobian: the second order of a rotation by so
+much is a pixel over the focal length, some thousandths of a pixel.
+"""
 
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
@@ -90,6 +97,17 @@ class _Layout(NamedTuple):
     fingers_m: Array
 
 
+class _Places(NamedTuple):
+    """Where points on the strips were projected at a pose (4, 4) and an opening: (m, 2), px, and by how much that
+    changes with the pose and the opening (m, 2, 7); zero where the lens maps nothing.
+    """
+
+    cam_T_grip: Array
+    jaw_opening_m: float | None
+    uv_px: Array
+    jacobian: Array
+
+
 class StripsRefused(ValueError):
     """Kept strips belong to something else, or don't hold together; the text says so."""
 
@@ -118,6 +136,7 @@ class FingerStrips:
         self._learnt_s = -math.inf
         self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
         self._layout: _Layout | None = None
+        self._places: dict[int, _Places] = {}  # by how far the strips go on
         self.ready = False
         """Whether it may judge: not by fingers of one shade."""
         self._usual = np.zeros(2 * REACH_PX + 1)  # correlations at each slide while the gripper stands in its place
@@ -234,15 +253,15 @@ class FingerStrips:
         self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
     ) -> NDArray[np.float32]:
         """(n, LENGTH_PX + 2 beyond) grey levels along the strips, without their slow changes."""
-        width = LENGTH_PX + 2 * (FILTERED_PX + beyond)
-        node, share = _nodes(width)
-        along = (node - FILTERED_PX - beyond)[:, None] * layout.step_m[:, None]
-        now = self._gripper.points_grip_m(jaw_opening_m)
-        moved = (now[self._first] - layout.fingers_m)[layout.finger]
-        points = (layout.start_m[:, None] + moved[:, None] + along).reshape(-1, 3)
-        uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
-        # A point outside the lens is NaN; OpenCV needs a number for it.
-        u, v = (c.reshape(-1, len(node)).astype(np.float32) @ share for c in np.nan_to_num(uv_px, nan=-1.0).T)
+        _, share = _nodes(LENGTH_PX + 2 * (FILTERED_PX + beyond))
+        kept = self._places.get(beyond)
+        moved_px = math.inf
+        if kept is not None and (kept.jaw_opening_m is None) == (jaw_opening_m is None):
+            opened_m = 0.0 if jaw_opening_m is None else jaw_opening_m - (kept.jaw_opening_m or 0.0)
+            u, v, moved_px = _followed(kept.uv_px, kept.jacobian, kept.cam_T_grip, cam_T_grip, opened_m, share)
+        if not moved_px <= KEPT_PX:
+            kept = self._places[beyond] = self._project(layout, cam_T_grip, jaw_opening_m, beyond)
+            u, v, _ = _followed(kept.uv_px, kept.jacobian, cam_T_grip, cam_T_grip, 0.0, share)
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         if values.ndim == 3:
             values = values @ GREY_BGR
@@ -250,8 +269,26 @@ class FingerStrips:
         fast = smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE)
         return np.asarray(fast[:, FILTERED_PX:-FILTERED_PX], dtype=np.float32)
 
+    def _project(self, layout: _Layout, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int) -> _Places:
+        node, _ = _nodes(LENGTH_PX + 2 * (FILTERED_PX + beyond))
+        along = (node - FILTERED_PX - beyond)[:, None] * layout.step_m[:, None]
+        now = self._gripper.points_grip_m(jaw_opening_m)[self._first]
+        rate: Array = np.zeros_like(now)
+        if jaw_opening_m is not None:
+            rate = self._gripper.point_motion(jaw_opening_m)[self._first]
+        moved = (now - layout.fingers_m)[layout.finger]
+        points = (layout.start_m[:, None] + moved[:, None] + along).reshape(-1, 3)
+        rotation = cam_T_grip[:3, :3]
+        lever = points @ rotation.T
+        uv_px, d_uv = self._camera.project_with_jacobian(lever + cam_T_grip[:3, 3])
+        opened = np.repeat(rate[layout.finger] @ rotation.T, len(node), axis=0)
+        turned = np.stack([np.cross(row, lever) for row in np.eye(3)], axis=-1)
+        jacobian = np.concatenate([d_uv, d_uv @ turned, d_uv @ opened[:, :, None]], axis=2)
+        # A point outside the lens is NaN; OpenCV needs a number for it.
+        return _Places(cam_T_grip.copy(), jaw_opening_m, np.nan_to_num(uv_px, nan=-1.0), np.nan_to_num(jacobian))
+
     def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
-        self._laid_out = cam_T_grip.copy(), jaw_opening_m
+        self._laid_out, self._places = (cam_T_grip.copy(), jaw_opening_m), {}
         start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
         if not len(start):
             return
@@ -332,6 +369,33 @@ class FingerStrips:
         return out
 
 
+@compiled
+def _followed(
+    uv_px: Any, jacobian: Any, from_T: Any, to_T: Any, opened_m: float, share: Any
+) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    """Points (n, w) of strips, u and v, px, at a pose ``to_T`` (4, 4) and an opening that is larger by ``opened_m``:
+    those of :class:`_Places`, k of each strip, and what lies between them by their ``share`` (k, w).  And the largest
+    motion of the former, px.
+    """
+    xi, largest, (nodes, width) = perturbation_between(from_T, to_T), 0.0, share.shape
+    count = len(uv_px) // nodes
+    at, place = np.zeros((2, width)), np.empty((2, count, width), np.float32)
+    for n in range(count):
+        at[:] = 0.0
+        for k in range(nodes):
+            for axis in range(2):
+                moved = jacobian[n * nodes + k, axis, 6] * opened_m
+                for i in range(6):
+                    moved += jacobian[n * nodes + k, axis, i] * xi[i]
+                largest = max(largest, abs(moved))
+                for w in range(width):
+                    at[axis, w] += share[k, w] * (uv_px[n * nodes + k, axis] + moved)
+        for axis in range(2):
+            for w in range(width):
+                place[axis, n, w] = at[axis, w]
+    return place[0], place[1], largest
+
+
 def _independent(within: NDArray[np.float32]) -> float:
     """Number of independent points ``within`` (n, LENGTH_PX) the fingers; strips side by side show the same."""
     return float(within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
@@ -359,3 +423,8 @@ def _nodes(width: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     node = np.linspace(0.0, width - 1.0, width // NODE_PX + 2)
     share = np.maximum(1.0 - np.abs(np.arange(width) - node[:, None]) / node[1], 0.0)
     return node, share.astype(np.float32)
+
+
+def warm_up() -> None:
+    """Compile what a frame needs, or load what was compiled."""
+    _followed(np.zeros((1, 2)), np.zeros((1, 2, 7)), np.eye(4), np.eye(4), 0.0, np.ones((1, 1), np.float32))

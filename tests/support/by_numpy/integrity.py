@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.geometry import invert, perturb, perturbation_between, skew
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints
 from gripmon.track.integrity.level_kernel import MOST_SIGMAS
@@ -236,6 +236,14 @@ def enter(
     columns = table[:, first : first + len(prior)]
     made = np.concatenate([prior[None], of[0] + farther[:, None], *of[1:]])
     columns[:] = np.where(np.arange(7)[:, None] == 0, made, np.where(prior > share, made, np.nan))
+
+
+def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
+    motion, lever, turn = cam_T_grip @ invert(first_T), np.eye(6), np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = motion[:3, :3]
+    lever[:3, 3:] = -skew(motion[:3, :3] @ (reference_T[:3, 3] - first_T[:3, 3]))
+    at_T = motion @ reference_T
+    return lever, turn, motion, at_T, perturbation_between(at_T, reference_T)
 
 
 def begun(
