@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from support.by_numpy.integrity import beyond
 
-from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
+from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, bounds, hypotheses_of, kernel
 from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
 from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails
 
@@ -98,7 +98,8 @@ def separate(
 ) -> Separation:
     """The fits under all hypotheses, with a gripper model that is exact."""
     model = np.zeros((1, *pull.shape)), np.zeros((1, len(pull)), dtype=np.intp), 1
-    return Sums.of_kept(pull, information, middle, model, keep, known, known_pull).fits(pull.shape[1])
+    sums = kernel.add_up(pull, information, middle, *model, keep, known, known_pull)
+    return Separation(*kernel.separate(*sums, pull.shape[1]))
 
 
 class Model:

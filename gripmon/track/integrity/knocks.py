@@ -43,9 +43,6 @@ occlusion, since the average rate of knocks is too low for both (docs/integrity.
 """
 
 
-_ANYWHERE = np.stack([np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M])
-
-
 def log_likely(shift_m: Array) -> Array:
     """(n,) natural logarithms of how likely knocks in any direction shift the TCP by ``shift_m`` (n, 3), over that of
     no shift at all.
@@ -68,12 +65,12 @@ class Knocks(NamedTuple):
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        length = float(np.linalg.norm(axis_cam))
+        length, kinds = float(np.linalg.norm(axis_cam)), len(ANY_SHARE)
         if length == 0.0:
-            return cls(np.array(ANY_SHARE), _ANYWHERE, np.zeros(len(ANY_SHARE), dtype=np.bool_))
-        covariance, way = _NONE_ALONG.covariance.copy(), axis_cam / length
-        covariance[len(ANY_SHARE) :, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
-        return _NONE_ALONG._replace(covariance=covariance)
+            return cls(np.array(ANY_SHARE), _BY_KIND.covariance[:kinds], _BY_KIND.along[:kinds])
+        covariance, way = _BY_KIND.covariance.copy(), axis_cam / length
+        covariance[kinds:, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
+        return _BY_KIND._replace(covariance=covariance)
 
     @property
     def spread(self) -> Array:
@@ -81,9 +78,12 @@ class Knocks(NamedTuple):
         return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
 
 
-_NONE_ALONG = Knocks(
+_BY_KIND = Knocks(
     np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]),
-    np.concatenate([_ANYWHERE, np.zeros((len(ALONG_SHARE), 6, 6))]),
+    np.stack(
+        [np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M]
+        + [np.zeros((6, 6))] * len(ALONG_SHARE)  # by the fingers' direction
+    ),
     np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
 )
 

@@ -69,42 +69,6 @@ class Separation(NamedTuple):
     of_model: Array
 
 
-class Sums(NamedTuple):
-    """Normal equations under all hypotheses: ``pull`` (h, m), ``normal`` matrices and covariances of the pulls, their
-    ``spread`` (h, m, m), and ``of_model`` (h, f, m), the pulls of the gripper's f parts.
-    """
-
-    pull: Array
-    normal: Array
-    spread: Array
-    of_model: Array
-
-    @classmethod
-    def of_kept(
-        cls,
-        pull: Array,
-        information: Array,
-        middle: Array,
-        model: tuple[Array, NDArray[np.intp], int],
-        keep: Array,
-        known: Array,
-        known_pull: Array,
-    ) -> Sums:
-        """Of the kept edges among v.
-
-        ``pull`` (v, m), ``information`` and ``middle`` (v, m, m) as the fit has them at its solution; ``model``: how
-        each edge pulls (p, v, m) where its parts of the gripper are off, which parts (p, v) these are, and how many
-        there are;
-        ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
-        """
-        pull, information, middle = map(np.ascontiguousarray, (pull, information, middle))
-        return cls(*kernel.add_up(pull, information, middle, *model, keep, known, known_pull))
-
-    def fits(self, unknowns: int = 6) -> Separation:
-        """The fits' first ``unknowns``.  Where nothing determines a direction, ``known`` must: LinAlgError else."""
-        return Separation(*kernel.separate(*self, unknowns))
-
-
 class Refitted(NamedTuple):
     """One frame's fits under all hypotheses: the pose ``fit_T`` (4, 4) that they are shifts from, where the pose that
     is known from before is ``at`` (6,), the fits ``alone`` and ``anchored``, with that pose as one more measurement,

@@ -43,11 +43,6 @@ FILTERED_PX = SLOPE_PX // 2 + 1
 NODE_PX = 16
 """Between points of a strip that are projected: lenses bend a line by less than a hundredth of a pixel between them."""
 
-KEPT_PX = 1.0
-"""Motion up to which points follow where they were projected, by their Jacobian: the second order of a rotation by so
-much is a pixel over the focal length, some thousandths of a pixel.
-"""
-
 INDEPENDENT_PX = 4.0
 """Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
 
@@ -259,7 +254,8 @@ class FingerStrips:
         if kept is not None and (kept.jaw_opening_m is None) == (jaw_opening_m is None):
             opened_m = 0.0 if jaw_opening_m is None else jaw_opening_m - (kept.jaw_opening_m or 0.0)
             u, v, moved_px = _followed(kept.uv_px, kept.jacobian, kept.cam_T_grip, cam_T_grip, opened_m, share)
-        if not moved_px <= KEPT_PX:
+        # Followed so far, they are off by the second order of a rotation by as much: its square over the focal length.
+        if not moved_px <= ONE_EDGE_PX:
             kept = self._places[beyond] = self._project(layout, cam_T_grip, jaw_opening_m, beyond)
             u, v, _ = _followed(kept.uv_px, kept.jacobian, cam_T_grip, cam_T_grip, 0.0, share)
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
