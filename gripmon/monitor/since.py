@@ -197,6 +197,7 @@ class AtReferences:
         """At the reference in force; None until a frame proves a pose."""
         self._growing: Average | None = None  # the average that b follows until there are enough frames
         self._risk = risk
+        self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
         self.changes = 0
         """Grows with each change that a restart should know."""
         self.now_ns = 0
@@ -246,7 +247,7 @@ class AtReferences:
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
         self._growing, self.current = None, self._known.get(self._id)
-        self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
+        self._unproved_T = None
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""

@@ -23,7 +23,7 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.weigher import LOOK_ODDS, NOT_AS_EXPECTED, Weigher
+from gripmon.monitor.weigher import LOOK_ODDS, Weigher
 from gripmon.track.edges import Measurement
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
@@ -164,7 +164,7 @@ class Integrity:
         if standing is not None and self.since.current is None:
             why = "the gripper is elsewhere, since no frame has proved yet where it is"
             if self._weigher.displaced(standing.measurement, now_s):
-                why = f"{NOT_AS_EXPECTED}, and no frame has proved yet where it is"
+                why = f"{self._weigher.not_as_expected}, and no frame has proved yet where it is"
             none = unbounded(self._policy.integrity_risk, why).since_reference
             standing = replace(standing, bounds=standing.bounds._replace(since_reference=none))
         return standing

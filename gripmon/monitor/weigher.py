@@ -35,11 +35,6 @@ from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.look import ONE_EDGE_PX
 
-NOT_AS_EXPECTED = (
-    "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where the "
-    "reference has it"
-)
-
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
 
@@ -54,6 +49,11 @@ LEAST_WEIGHT_RATIO = 1e-3
 
 class Weigher:
     """Protection levels of one monitor's measurements, and the anchor that they rest on."""
+
+    not_as_expected = (
+        "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where "
+        "the reference has it"
+    )
 
     def __init__(
         self,
@@ -449,7 +449,7 @@ class Weigher:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
         risk = self._policy.integrity_risk
         position_m, rotation_rad = _radii(self._expected[1], risk)
-        why = NOT_AS_EXPECTED
+        why = self.not_as_expected
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
