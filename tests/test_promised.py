@@ -218,7 +218,7 @@ def test_a_gripper_that_is_not_at_the_reference_is_said_with_its_distance():
     off = perturb(nominal_cam_T_grip(), np.array([0.0, 0.0, 9e-3, 0.0, 0.0, 0.0]))
     covariance = tuple(np.diag([1e-6] * 3 + [1e-6] * 3).ravel().tolist())
     reference = ReferenceRecord("off", 0, 0, "configuration", to_record(off), covariance)
-    images = images_of(moving_robot(4))[:3]
+    images = images_of(moving_robot(4, opening_m=OPENING_M), 3)
     frames = as_frames([TeachingImage(image, OPENING_M, f"{k}") for k, image in enumerate(images)])
     found = kept(rig, reference, frames)
     assert found.away_m == pytest.approx(9e-3, abs=3e-4) and found.away_rad == pytest.approx(0.0, abs=5e-3)

@@ -81,9 +81,9 @@ class Kept(msgspec.Struct, frozen=True):
     ``valid_by`` names the one that a verdict goes by.
 
     ``hypothesis``: what it can't be excluded most often, that makes this bound as large, and in how many images;
-    ``reason``: why most of those that weren't measured weren't.  ``away_m`` and ``away_rad``: how far from the reference
-    the images show the gripper, in the median; None where none was measured.  ``helps``: what would help most, and the median that
-    the bound has with it, None where that wasn't computed.
+    ``reason``: why most of those that weren't measured weren't.  ``away_m`` and ``away_rad``: how far from the
+    reference the images show the gripper, in the median; None where none was measured.  ``helps``: what would help
+    most, and the median that the bound has with it, None where that wasn't computed.
 
     ``forecast``: of no image, but of a frame that measures all edges in view, before the usual clutter.
     """
@@ -312,6 +312,8 @@ def with_help(found: Kept, rig: Rig, again: Callable[[Rig], Kept]) -> Kept:
     """The same with the one thing that helps most: ``again`` says what is kept with each thing known that a person can
     measure, and if none of these suffices, with less to be promised.  Where none helps, what the hypothesis asks for.
     """
+    if found.hypothesis.startswith(Weigher.not_as_expected):
+        return msgspec.structs.replace(found, helps=_asked_for(found))
     tried = {words: again(known) for words, known in as_if_measured(rig).items()}
     if found.valid_by is ValidBy.ABSOLUTE and not any(each.reachable for each in tried.values()):
         tried["valid_by: reference, if only the motion since the reference counts"] = msgspec.structs.replace(
