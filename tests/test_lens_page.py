@@ -19,7 +19,7 @@ from gripmon.model.targets import parse_target
 @pytest.fixture(scope="module")
 def found() -> CameraFromViews:
     rng = np.random.default_rng(2)
-    views = [replace(view, name=f"</b>{k}.png") for k, view in enumerate(seen(CAMERAS["paper"], poses(rng, 6), rng))]
+    views = [replace(view, name=f"<b>{k}.png") for k, view in enumerate(seen(CAMERAS["paper"], poses(rng, 6), rng))]
     views[3].uv_px[7] += 30.0
     target = parse_target("chequerboard:9x7:0.02")
     return CameraFromViews(calibrate(views, "paper"), target, {"none.png": "no <i>board</i>"})
@@ -44,7 +44,7 @@ def test_each_point_stands_where_it_is_with_its_residual(found: CameraFromViews)
     # The point that is wrong is red, its arrow is cut, and a name is a name.
     wrong = traces["left out", "markers"]
     assert [*wrong["x"], *wrong["y"]] == pytest.approx(found.sightings[3].uv_px[7].tolist(), abs=1e-6)
-    assert wrong["text"] == [f"&lt;/b&gt;3.png: {np.linalg.norm(found.fit.residuals_px[3][7]):.3f} px"]
+    assert wrong["text"] == [f"&lt;b&gt;3.png: {np.linalg.norm(found.fit.residuals_px[3][7]):.3f} px"]
     length = np.hypot(*(np.diff(traces["left out", "lines"][axis][:2])[0] for axis in "xy"))
     assert length == pytest.approx(0.06 * found.camera.width_px, rel=1e-6)
     assert made["layout"]["yaxis"]["range"] == [575.5, -0.5] and made["layout"]["xaxis"]["range"] == [-0.5, 767.5]
@@ -65,7 +65,7 @@ def test_images_parameters_and_what_is_not_used_are_on_it(found: CameraFromViews
     page = lens_page(found, "camera.yaml")
     (bars,) = figures(page)["views"]["data"]
     np.testing.assert_allclose(bars["x"], found.fit.view_rms_px, atol=1e-6)
-    assert bars["y"][2] == "&lt;/b&gt;2.png" and "1 left out" in bars["text"][3]
+    assert bars["y"][2] == "&lt;b&gt;2.png" and "1 left out" in bars["text"][3]
     text = page.decode()
     assert "no &lt;i&gt;board&lt;/i&gt;" in text and f"{found.camera.fx_px:.6g}" in text
     assert "https://" not in re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)

@@ -61,7 +61,7 @@ def residual_figure(found: CameraFromViews) -> Figure:
         if not len(at):
             continue
         lines = np.stack([at, to, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
-        named, group = f"{name}, {enlarged:.3g} times", {"legendgroup": name}
+        named, group = f"{name}, {enlarged:{'.0f' if enlarged >= 100.0 else '.2g'}} times", {"legendgroup": name}
         figure.add(1, lines[:, 0], lines[:, 1], named, line={"color": colour, "width": 1.2}, hoverinfo="skip", **group)
         figure.add(
             1, at[:, 0], at[:, 1], named, mode="markers", marker={"color": colour, "size": 4}, text=words,

@@ -153,13 +153,6 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def number_text(value: float) -> str:
-    """The shortest text that reads back as the same number, also in YAML 1.1: ``1.0e-05``."""
-    text = repr(float(value))
-    mantissa, e, exponent = text.partition("e")
-    return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else text
-
-
 def read_mapping(file: str, text: str, right: str) -> dict[str, Any]:
     """The mapping in a file's text, as YAML; ``right`` says what kind of file it should be."""
     value = _as_yaml(file, text, right)
