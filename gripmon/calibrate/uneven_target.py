@@ -45,8 +45,8 @@ def with_shape(
     problem = BundleProblem(lens_model, alike, free, target=target)
     if tested:
         ratio = problem.gain(flat) / target.unknowns
-        # The numbering is the best of so many.
-        tried = math.prod(view.turns for view in sightings if view.turns)
+        # The numbering is the best of so many; of a thousand views their number is beyond floats.
+        tried = 2.0 ** min(sum(math.log2(view.turns) for view in sightings if view.turns), 1000.0)
         if fdtrc(target.unknowns, bundle.degrees_of_freedom, ratio) * tried > CHANCE:
             return None, ()
     whole = sum(view.turns > 0 for view in sightings)
