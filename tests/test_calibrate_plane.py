@@ -267,6 +267,7 @@ def test_the_same_as_json(here: Path, capsys: pytest.CaptureFixture[str]):
     found = hand_eye(here / "he.yaml")
     assert said["covariance"] == list(found.covariance) and said["rms_m"] == found.residuals.rms_m
     assert said["sides_m"] == pytest.approx([0.034, 0.016], abs=1e-4) and said["written"] == ["new.yaml", "he.yaml"]
+    assert said["not_in_covariance"] == "bevelled edges, and dark ones before dark print"
     (image,) = said["images"]
     assert image["corners"]["left_inner_near"]["uv_px"] == pytest.approx(
         true_corners(TRUE)["L_in_near"].tolist(), abs=0.3

@@ -218,13 +218,13 @@ BAD_USAGE = {
     "no spot column": (lambda d, r: without(r, "u_px"), "line 2: has neither u_px and v_px nor image"),
     "no pose column": (lambda d, r: without(r, "ty_m"), "line 2: has no column ty_m"),
     "no rotation": (lambda d, r: without(r, "qx", "qy", "qz", "qw"), "line 2: has no rotation"),
-    "no w": (lambda d, r: without(r, "qw"), "line 2: has no qw"),
-    "text": (lambda d, r: changed(r, 3, tx_m="near"), "line 5: tx_m is 'near'; a number"),
-    "nan": (lambda d, r: changed(r, 3, tx_m="nan"), "line 5: tx_m is 'nan'"),
-    "no unit quaternion": (lambda d, r: changed(r, 2, qx=90.0), "line 4: the quaternion 90"),
+    "no w": (lambda d, r: without(r, "qw"), "line 2: qw: is missing"),
+    "text": (lambda d, r: changed(r, 3, tx_m="near"), "line 5: tx_m: 'near' is not a number"),
+    "nan": (lambda d, r: changed(r, 3, tx_m="nan"), "line 5: tx_m: 'nan' is not a number"),
+    "no unit quaternion": (lambda d, r: changed(r, 2, qx=90.0), "line 4: its quaternion has length 90 (degrees?)"),
     "degrees": (
         lambda d, r: [{**dict(list(row.items())[:5]), "rx_rad": 90.0, "ry_rad": 0.0, "rz_rad": 45.0} for row in r],
-        "more than once around: degrees? radians",
+        "line 2: turns by 100.6 rad, more than once around (degrees?); radians",
     ),
     "millimetres": (
         lambda d, r: [{**row, **{k: 1000.0 * row[k] for k in ("tx_m", "ty_m", "tz_m")}} for row in r],

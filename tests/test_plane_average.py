@@ -64,6 +64,7 @@ def test_one_image_is_its_own_mean():
     np.testing.assert_allclose(mean.cam_T_grip, one.cam_T_grip, atol=1e-15)
     np.testing.assert_allclose(mean.covariance, one.covariance, rtol=1e-6, atol=1e-20)
     assert mean.consistency_p is None and mean.warnings == ()
+    assert "+- of noise, camera and print; without bevelled edges, and dark ones before dark print" in mean.summary()
 
 
 def test_more_images_are_more_exact_but_not_more_than_their_camera():

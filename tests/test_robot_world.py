@@ -14,6 +14,7 @@ from gripmon.calibrate import robot_world
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.tables import pose_of, rows_of
 from gripmon.cli import main
+from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert, make_transform, perturb, perturbation_between
 
 
@@ -163,14 +164,18 @@ def test_numbers_that_yaml_takes_for_text_are_numbers_also_in_nested_lists(tmp_p
     pose = "{translation_m: [1e-3, -2.5E-1, 3], rotation_xyzw: [0, 0, 1e0, 0.0]}"
     rows = "[1, 0, 0, 1e-3], [0, 1, 0, 2], [0, 0, 1, -1e-1], [0, 0, 0, 1]"
     path = tmp_path / "poses.yaml"
-    path.write_text(f"samples:\n- base_T_ee: {pose}\n- base_T_ee: [{rows}]\n- base_T_ee: [[a, 1, 1, 1]]\n")
-    samples, places = rows_of(path)
-    assert pose_of(samples[0], places[0])[:3, 3] == pytest.approx([1e-3, -0.25, 3.0])
-    assert pose_of(samples[1], places[1])[:3, 3] == pytest.approx([1e-3, 2.0, -0.1])
-    with pytest.raises(ValueError, match="sample 3: base_T_ee is not a transform"):
-        pose_of(samples[2], places[2])
-    with pytest.raises(ValueError, match=r"translation_m is \['x', 0, 0\]; 3 numbers"):
-        pose_of({"base_T_ee": {"translation_m": ["x", 0, 0], "rotation_xyzw": [0, 0, 0, 1]}}, "sample 1")
+    wrong = "{translation_m: [x, 0, 0], rotation_xyzw: [0, 0, 0, 1]}", "{translation_m: [0, 0, 0]}", "[[a, 1, 1, 1]]"
+    path.write_text("samples:\n" + "".join(f"- base_T_ee: {each}\n" for each in (pose, f"[{rows}]", *wrong)))
+    samples = rows_of(path)
+    assert pose_of(samples[0])[:3, 3] == pytest.approx([1e-3, -0.25, 3.0])
+    assert pose_of(samples[1])[:3, 3] == pytest.approx([1e-3, 2.0, -0.1])
+    for sample, said in (
+        (samples[2], r"poses.yaml: sample 3: base_T_ee.translation_m\[0\]: 'x' is not a number"),
+        (samples[3], "sample 4: base_T_ee: has the keys translation_m; translation_m and rotation_xyzw, or 4 x 4"),
+        (samples[4], "sample 5: base_T_ee: holds 4 values; translation_m and rotation_xyzw, or 4 x 4 numbers"),
+    ):
+        with pytest.raises(InputError, match=said):
+            pose_of(sample)
 
 
 def test_wrong_poses_are_left_out():

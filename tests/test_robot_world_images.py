@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 
 import cv2
 import msgspec
@@ -14,10 +13,12 @@ from support.plates import pose, render
 from test_robot_world import columns, transform
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.detection import detect, upright
+from gripmon.calibrate.detection import by_colours, detect
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.grey_levels import to_grey
 from gripmon.calibrate.plate_pose import plate_pose, pose_slopes
-from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.tables import target_pose
 from gripmon.cli import main
 from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.geometry import invert, perturbation_between
@@ -121,31 +122,41 @@ def test_a_chequerboard_is_turned_by_its_colours():
     for k, roll in enumerate((0.1, 1.7, 3.0, 4.5)):
         true = pose(target, [*rng.uniform(-0.01, 0.01, 2), 0.45], rng.uniform(-0.4, 0.4, 2), roll)
         image = render(LENS, true, target, seed=k)
-        sighting = upright(image, detect(image, target), target)
-        assert isinstance(sighting, Sighting)
+        sighting, inverted = detect(image, target), detect(255 - image, target)
+        assert isinstance(sighting, Sighting) and isinstance(inverted, Sighting)
         found, _, _ = plate_pose(LENS, sighting)
         turns.append(found[:3, :3].T @ true[:3, :3])
         # The board's own frame, or that after half a turn: the same one whichever way up it is in the image.
         assert np.abs(turns[-1] - turns[0]).max() < 0.01
         assert np.abs(np.abs(turns[-1]) - np.eye(3)).max() < 0.01
-        dark = 255 - image
-        inverted = upright(dark, sighting, target)
-        assert isinstance(inverted, Sighting)
-        assert np.allclose(inverted.plate_m[:, :2], [0.2, 0.125] - sighting.plate_m[:, :2])
-    part = replace(sighting, uv_px=sighting.uv_px[1:], plate_m=sighting.plate_m[1:])
-    assert isinstance(upright(image, part, target), NotFound)
-    assert isinstance(upright(np.full_like(image, 90), sighting, target), NotFound)
+        assert sighting.turns == inverted.turns == 1
+        last = np.linalg.norm(inverted.uv_px - sighting.uv_px[np.argmin(sighting.plate_m.sum(axis=1))], axis=1).argmin()
+        assert np.allclose(inverted.plate_m[last], [0.2, 0.125, 0.0])
+    image[200:280, 270:370] = 128  # something on the board
+    with pytest.raises(CalibrationError, match=r"\d+ of the target's 54 points; all of them, to tell which way up"):
+        target_pose(image, GivenCamera(LENS), target)
+
+
+@pytest.mark.parametrize(
+    ("target", "turns"),
+    [("chequerboard:7x5:0.03", 2), ("circles:6x6:0.03:0.015", 4), ("circles:7x6:0.03:0.015", 2),
+     ("acircles:3x9:0.05:0.018", 1), ("acircles:3x8:0.05:0.018", 2), (TARGET, 1)],
+)  # fmt: skip
+def test_in_how_many_ways_a_whole_target_looks_the_same(target: str, turns: int):
+    known = parse_target(target)
+    sight = detect(render(LENS, pose(known, (0.0, 0.0, 0.45), (0.3, -0.2), 0.2), known, seed=1), known)
+    assert isinstance(sight, Sighting) and sight.turns == turns
+    near = detect(render(LENS, pose(known, (0.04, 0.0, 0.2), (0.3, -0.2), 0.2), known, seed=1), known)
+    assert isinstance(near, Sighting) and near.turns == (1 if target == TARGET else 0), "a part of it"
 
 
 @pytest.mark.parametrize(("contrast_dn", "tells"), [(44, True), (36, False)])
 def test_colours_tell_from_a_fifth_of_the_grey_levels_range_on(contrast_dn: int, tells: bool):
     """Of 12 squares 10 are dark or light, one is black and one white, so that they span 200 grey levels."""
-    target, step = parse_target("chequerboard:5x4:0.02"), 40
+    step = 40
     cells = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1).reshape(-1, 2)
     image = np.full((240, 280), 100, np.uint8)
     for column, row in np.argwhere(np.indices((4, 3)).sum(axis=0) % 2 == 1).tolist():
         image[60 + step * row : 60 + step * (row + 1), 60 + step * column : 60 + step * (column + 1)] += contrast_dn
     image[60:100, 60:100], image[60:100, 100:140] = 20, 220
-    plate_m = np.column_stack([0.02 * cells, np.zeros(20)])
-    at = Sighting(60.0 + step * cells, plate_m, np.tile(np.eye(2), (20, 1, 1)), np.arange(20), (280, 240))
-    assert isinstance(upright(image, at, target), Sighting) is tells
+    assert (by_colours(to_grey(image), cells, 60.0 + step * cells) is not None) is tells

@@ -53,6 +53,7 @@ from gripmon.model.images import read_image
 from gripmon.model.records import Frame, Image, Transform, Verdict
 from gripmon.model.targets import parse_target
 from gripmon.teach.messages import BadRequest, CornersRequest, EmptyRequest, SaveOrder
+from gripmon.teach.page_server import Sandboxed
 
 TARGET = parse_target(new_user.TARGET)
 
@@ -409,6 +410,18 @@ def test_the_command_of_a_page_can_be_typed_where_a_person_is(tmp_path: Path, ca
     (folder / "standing" / "000.png").write_text("")
     assert main(["setup", str(folder), "--step", "corners"]) == 2
     assert f"cd '{folder}' && gripmon teach --page standing/000.png" in capsys.readouterr().err
+
+
+def test_the_page_of_a_lens_is_shown_without_the_sites_origin(tmp_path: Path):
+    (tmp_path / "camera.html").write_text("<script>anyone's</script>")
+    site = SetupSite(Project(tmp_path))
+    try:
+        (shown,) = (card.picture for card in site.state().steps if card.picture)
+        data, kind = site.get(shown) or (b"", "")
+    finally:
+        site.close()
+    assert shown.startswith("file/camera.html?") and kind.startswith("text/html")
+    assert isinstance(data, Sandboxed) and data == b"<script>anyone's</script>"
 
 
 def test_what_the_ruler_says_scales_the_target(tmp_path: Path):

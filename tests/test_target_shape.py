@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.sightings import CAMERAS, PLATE_M, poses, seen
+from support.sightings import CAMERAS, PLATE_M, part_of, poses, seen
 
 from gripmon.calibrate.bundle import BundleProblem
 from gripmon.calibrate.cross_validation import cross_validate, with_scatter
@@ -37,10 +37,14 @@ def leaning(rng: np.random.Generator, count: int) -> list[Array]:
     return out
 
 
-def twisted(seed: int, *, anchored: bool, count: int = 16) -> list[Sighting]:
+def twisted(seed: int, *, turns: int, count: int = 16) -> list[Sighting]:
     rng = np.random.default_rng(seed)
     held = leaning(rng, count)
-    return seen(CAMERA, held, rng, noise_px=0.05, displacement_m=TWISTED, anchored=anchored)
+    return seen(CAMERA, held, rng, noise_px=0.05, displacement_m=TWISTED, turns=turns)
+
+
+LOPSIDED = np.stack([0.0003 * Y, 0 * X, 0.0008 * X**2 + 0.002 * X**3 + 0.001 * Y**3], axis=1)
+"""Another shape after half a turn, and after a quarter."""
 
 
 def in_sigmas(found: IntrinsicsResult) -> Array:
@@ -50,8 +54,8 @@ def in_sigmas(found: IntrinsicsResult) -> Array:
 
 def test_the_shape_is_estimated_where_every_image_tells_the_points(monkeypatch: pytest.MonkeyPatch):
     """Images that don't would hold their points flat, with all their weight; a fit that fails costs no camera."""
-    views = twisted(0, anchored=True)
-    some = [*views[:10], *(replace(view, anchored=False) for view in views[10:])]
+    views = twisted(0, turns=1)
+    some = [*views[:10], *(replace(view, turns=0) for view in views[10:])]
     for given, words in ((some, "as 10 of these 16 do"), (views, "its shape couldn't be estimated")):
         if given is views:
             monkeypatch.setattr(BundleProblem, "solve", only_of_flat_ones(BundleProblem.solve))
@@ -76,7 +80,7 @@ def test_a_twisted_target_gives_the_camera_and_its_own_shape():
     """With an exact one assumed, the same images are wrong by ten of their standard deviations."""
     squares = []
     for seed in range(4):
-        views = twisted(seed, anchored=True)
+        views = twisted(seed, turns=1)
         found = calibrate(views, MODEL)
         assert found.target is not None and 0.04 < found.rms_px < 0.055
         assert any("isn't flat and exact" in warning for warning in found.warnings)
@@ -85,39 +89,64 @@ def test_a_twisted_target_gives_the_camera_and_its_own_shape():
         error = lens_vector(found.camera)[list(range(8))] - TRUE
         squares.append(error @ np.linalg.solve(found.covariance, error) / len(error))
     assert 0.4 < np.mean(squares) < 1.95  # 32 degrees of freedom: 0.42 to 1.93 in 99.9 %
-    flat = calibrate(twisted(0, anchored=True), MODEL, exact_target=True)
+    flat = calibrate(twisted(0, turns=1), MODEL, exact_target=True)
     assert np.abs(in_sigmas(flat)).max() > 10.0
 
 
-def test_an_exact_target_is_taken_for_one():
+def as_numbered(view: Sighting, turns: int, number: int) -> Sighting:
+    """By an image that doesn't tell which of so many turns its points have."""
+    about = np.array([0.08 if turns == 2 else 0.06, 0.06, 0.0])
+    turn = exp_rotation(np.array([0.0, 0.0, 2.0 * np.pi * number / turns]))
+    return replace(view, plate_m=(view.plate_m - about) @ turn.T + about, turns=turns)
+
+
+@pytest.mark.parametrize("turns", [2, 4])
+def test_whole_views_of_an_unmarked_target_are_numbered_alike(turns: int):
+    """Each may be turned by half, or on a square target by a quarter; numbered as they come, they hold a mixture."""
+    rng = np.random.default_rng(3)
+    told = seen(CAMERA, leaning(rng, 14), rng, noise_px=0.05, displacement_m=LOPSIDED, turns=1)
+    if turns == 4:
+        told = [part_of(view, 0.12, 0.12) for view in told]
+    views = [as_numbered(view, turns, int(rng.integers(turns))) for view in told]
+    right, found = calibrate(told, MODEL), calibrate(views, MODEL)
+    assert right.target is not None and found.target is not None
+    assert found.rms_px == pytest.approx(right.rms_px, rel=1e-3) and 0.04 < found.rms_px < 0.055
+    np.testing.assert_allclose(lens_vector(found.camera), lens_vector(right.camera), rtol=1e-3, atol=1e-4)
+    assert np.abs(in_sigmas(found)).max() < 4.0
+    # A view that had no part in it is numbered like the others, too.
+    assert cross_validate(found).rms_px == pytest.approx(cross_validate(right).rms_px, rel=0.01)
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_an_exact_target_is_taken_for_one(turns: int):
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        views = seen(CAMERA, leaning(rng, 12), rng, noise_px=0.05, anchored=True)
+        views = seen(CAMERA, leaning(rng, 12), rng, noise_px=0.05, turns=turns)
         found = calibrate(views, MODEL)
         assert found.target is None and not any("flat" in warning for warning in found.warnings)
-        again = with_scatter(found, cross_validate(views, found), views)
+        again = with_scatter(found, cross_validate(found))
         assert np.array_equal(again.covariance, found.covariance) and again.warnings == found.warnings
 
 
 def test_where_the_images_dont_tell_which_point_is_which_the_error_is_enlarged():
     """By what parts of the views differ; what is wrong in all of them alike doesn't show in that."""
     for seed in range(2):
-        views = twisted(seed, anchored=False)
+        views = twisted(seed, turns=0)
         found = calibrate(views, MODEL)
         assert found.target is None and np.abs(in_sigmas(found)).max() > 5.0
-        covered = with_scatter(found, cross_validate(views, found), views)
+        covered = with_scatter(found, cross_validate(found))
         assert np.abs(in_sigmas(covered)).max() < 0.4 * np.abs(in_sigmas(found)).max()
         assert any("differ more than their errors allow" in warning for warning in covered.warnings)
 
 
 def test_views_that_had_no_part_in_the_fit_have_the_shape_that_was_found_without_them():
-    views = twisted(0, anchored=True)
-    assert cross_validate(views, calibrate(views, MODEL)).rms_px == pytest.approx(0.05, rel=0.1)
+    views = twisted(0, turns=1)
+    assert cross_validate(calibrate(views, MODEL)).rms_px == pytest.approx(0.05, rel=0.1)
 
 
 def test_the_right_hand_side_is_the_costs_slope():
     """Of all unknowns: lens, poses, displacements."""
-    views = twisted(1, anchored=True, count=4)
+    views = twisted(1, turns=1, count=4)
     model = LensModel(MODEL, *views[0].size_px)
     target = TargetPoints.of(views)
     assert target is not None

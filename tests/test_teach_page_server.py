@@ -25,7 +25,7 @@ from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture
 from gripmon.teach.messages import BadRequest, Evaluation, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page_server import PageServer
+from gripmon.teach.page_server import PageServer, Sandboxed, Served
 from gripmon.teach.session import Labels, Setup, TeachSession
 from gripmon.teach.sites import OutlineSite, TeachSite
 
@@ -111,6 +111,27 @@ def test_every_file_of_the_page_is_served_and_allows_nobody_else(served: PageSer
     assert b"<script" in page and b"style=" not in page and b"onclick" not in page
     status, headers, data = ask(served, "image/0.png")
     assert status == 200 and data.startswith(b"\x89PNG")
+
+
+def test_a_page_with_scripts_of_its_own_runs_them_without_the_sites_origin():
+    """A file of a project may be anyone's: its scripts could carry out the steps of ``gripmon setup``."""
+
+    class Pages:
+        def get(self, path: str) -> Served | None:
+            return Sandboxed(b"<script>1</script>") if path == "own" else b"{}", "text/html"
+
+        def post(self, path: str) -> None:
+            return None
+
+    server = PageServer(Pages())
+    try:
+        own, plain = (ask(server, path)[1] for path in ("own", "other"))
+    finally:
+        server.close()
+    assert own["Content-Security-Policy"].startswith("sandbox allow-scripts; default-src 'none'; script-src 'unsafe-in")
+    assert "allow-same-origin" not in own["Content-Security-Policy"]
+    assert own["Cross-Origin-Opener-Policy"] == "unsafe-none" and own["X-Content-Type-Options"] == "nosniff"
+    assert "unsafe" not in plain["Content-Security-Policy"] and plain["Cross-Origin-Opener-Policy"] == "same-origin"
 
 
 def test_without_the_token_or_under_another_name_nothing_is_told(served: PageServer):

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -38,7 +37,7 @@ from gripmon.model.images import images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
-from gripmon.model.targets import Charuco, Chequerboard, Target, TargetError, name_of, parse_target
+from gripmon.model.targets import Charuco, Target, TargetError, name_of, parse_target
 
 __all__ = ["CameraFromViews", "calibrate_intrinsics", "calibrate_robot_world", "verify"]
 
@@ -54,8 +53,12 @@ class CameraFromViews:
 
     fit: IntrinsicsResult
     target: Target
-    sightings: tuple[Sighting, ...]
     not_found: Mapping[str, str]
+
+    @property
+    def sightings(self) -> tuple[Sighting, ...]:
+        """The images that the fit is to."""
+        return self.fit.sightings
 
     @property
     def camera(self) -> LensSettings:
@@ -134,10 +137,9 @@ def calibrate_intrinsics(
     check_fixed(fixed, model)
     sightings, not_found = _views(images, target, progress)
     found, contradicting = _agreeing(sightings, model, fixed, progress)
-    sightings = [sighting for sighting in sightings if sighting.name not in contradicting]
     left_out = [f"{name} is left out: {reason}" for name, reason in contradicting.items()]
-    found = replace(found, warnings=(*left_out, *found.warnings, *_about_target(sightings, target)))
-    return CameraFromViews(found, target, tuple(sightings), MappingProxyType({**not_found, **contradicting}))
+    found = replace(found, warnings=(*left_out, *found.warnings, *_about_target(found.sightings, target)))
+    return CameraFromViews(found, target, MappingProxyType({**not_found, **contradicting}))
 
 
 def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
@@ -167,14 +169,14 @@ def _views(
     sightings: list[Sighting] = []
     not_found: dict[str, str] = {}
     larger: list[str] = []
-    smaller: list[str] = []
+    smaller: list[tuple[str, tuple[int, int]]] = []
     with progress(len(images), "image") as step:
         for name, image in images_of_one_camera(images):
             sight = detect(image, target, name)
             if isinstance(sight, NotFound):
                 not_found[name] = sight.reason
                 larger += [f"{name}: {sight.reason}"] if sight.larger else []
-                smaller += [f"{name}: {sight.reason}"] if sight.smaller else []
+                smaller += [(f"{name}: {sight.reason}", sight.whole)] if sight.whole else []
             else:
                 sightings.append(sight)
             step()
@@ -191,9 +193,12 @@ def _views(
     if larger:
         # If the rest is hidden or out of view, a smaller target fits as well: such images prove nothing.
         raise TargetError(f"{len(larger)} of {len(images)} images show a larger one ({larger[0]}); its full size")
-    if smaller and not any(sighting.anchored for sighting in sightings):
-        of = f"{len(smaller)} of {len(images)} images show a smaller one whole, none this one"
-        raise TargetError(f"{of} ({smaller[0]}); its full size")
+    # A smaller one beside the target, or a misjudged end, is left out where other images show more than it has.
+    spans = [_points_along(sighting, target) for sighting in sightings]
+    small = [(said, whole) for said, whole in smaller if all(a <= whole[0] and b <= whole[1] for a, b in spans)]
+    if small:
+        of = f"{len(small)} of {len(images)} images show a smaller one whole, none shows more"
+        raise TargetError(f"{of} ({small[0][0]}); its full size")
     return sightings, not_found
 
 
@@ -228,20 +233,23 @@ def _fitted(
         else:
             result = intrinsics.calibrate(sightings, model, fixed=fixed)
             step()
-        crossed = cross_validate(sightings, result, fixed=fixed, folds=_FOLDS, step=step)
-    return with_scatter(result, crossed, sightings)
+        crossed = cross_validate(result, fixed=fixed, folds=_FOLDS, step=step)
+    return with_scatter(result, crossed)
 
 
-def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
+def _points_along(sighting: Sighting, target: Target) -> tuple[int, int]:
+    """How many points a sighting spans along both sides, the longer first."""
+    steps = np.rint(np.ptp(sighting.plate_m[:, :2], axis=0) / target.step_m)
+    short, long = sorted(int(each) + 1 for each in steps)
+    return long, short
+
+
+def _about_target(sightings: Sequence[Sighting], target: Target) -> list[str]:
     """A warning if the target may be smaller than it was described: without markers nothing else reveals that."""
     if isinstance(target, Charuco):
         return []
-    if isinstance(target, Chequerboard):
-        step_m, whole = target.square_m, [target.columns, target.rows]
-    else:
-        step_m, whole = target.step_m, [max(each) + 1 for each in zip(*target.places, strict=True)]
-    spans = [sorted(np.ptp(s.plate_m[:, :2], axis=0).tolist(), reverse=True) for s in sightings]
-    seen = [round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)]
+    whole = [last + 1 for last in target.last]
+    seen = [max(each) for each in zip(*(_points_along(s, target) for s in sightings), strict=True)]
     if seen[0] >= max(whole) or len(sightings) == 1:
         return []
     points = f"{seen[0]} x {seen[1]} of the target's {whole[0]} x {whole[1]} points"
@@ -270,112 +278,3 @@ def calibrate_robot_world(
     )
     robot_world.check_reading(found, cam_T_target, arm)
     return found
-
-
-_MAP_PX = 900
-_SIDE_PX = 380
-_TOP_PX = 64
-_CELLS = 12
-_LONGEST_PX = 28.0
-"""Length of an arrow for three standard deviations (px)."""
-_INK, _PALE, _GOOD, _BAD, _EMPTY = (40, 40, 40), (245, 245, 245), (150, 90, 20), (40, 40, 210), (205, 205, 225)
-_SUBPIXEL_BITS = 4
-_Colour = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """Where the image lies in the picture."""
-
-    scale: float
-    width: int
-    height: int
-
-    def at(self, uv_px: Array) -> Array:
-        out: Array = (uv_px + 0.5) * self.scale + np.array([0.0, _TOP_PX])
-        return out
-
-
-def draw_maps(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> Image:
-    """Picture of the calibration, BGR.  Image cells without points are tinted; arrows are enlarged residuals, with the
-    factor in the title; red ones were left out.  On the right each view's root mean square residual.
-    """
-    size = (result.camera.width_px, result.camera.height_px)
-    scale = _MAP_PX / size[0]
-    frame = _Frame(scale, _MAP_PX, round(scale * size[1]))
-    picture = np.full((max(frame.height, 240) + _TOP_PX, frame.width + _SIDE_PX, 3), 255, np.uint8)
-    _coverage(picture, frame, sightings, size)
-    enlarged = _LONGEST_PX / max(3.0 * result.rms_px, 1e-6)
-    for sighting, residual, used in zip(sightings, result.residuals_px, result.used, strict=True):
-        start = frame.at(sighting.uv_px)
-        length = np.linalg.norm(residual, axis=1, keepdims=True) * enlarged
-        # Large outliers would cross the whole picture.
-        arrow = np.nan_to_num(residual) * enlarged * np.minimum(1.0, 2.0 * _LONGEST_PX / np.maximum(length, 1e-9))
-        for a, b, good in zip(start, start + np.nan_to_num(arrow), used.tolist(), strict=True):
-            colour = _GOOD if good else _BAD
-            line(picture, a, b, colour)
-            disc(picture, a, 1.5, colour)
-    centre = frame.at(np.array([[result.camera.cx_px, result.camera.cy_px]]))[0]
-    at = (round(float(centre[0])), round(float(centre[1])))
-    cv2.drawMarker(picture, at, _INK, cv2.MARKER_CROSS, 18, 1, cv2.LINE_AA)
-    _bars(picture, frame, result, sightings)
-    _titles(picture, frame, result, sightings, enlarged / scale)
-    return picture
-
-
-def _coverage(picture: Image, frame: _Frame, sightings: Sequence[Sighting], size: tuple[int, int]) -> None:
-    rows = max(1, round(_CELLS * size[1] / size[0]))
-    points = np.concatenate([s.uv_px for s in sightings]) / np.array(size)
-    counts, _, _ = np.histogram2d(points[:, 1], points[:, 0], bins=(rows, _CELLS), range=((0, 1), (0, 1)))
-    edges_x = np.rint(np.linspace(0, frame.width, _CELLS + 1)).astype(int)
-    edges_y = np.rint(np.linspace(0, frame.height, rows + 1)).astype(int) + _TOP_PX
-    for r, c in np.ndindex(*counts.shape):
-        corners = (int(edges_x[c]), int(edges_y[r])), (int(edges_x[c + 1]) - 1, int(edges_y[r + 1]) - 1)
-        cv2.rectangle(picture, *corners, _PALE if counts[r, c] else _EMPTY, -1)
-    cv2.rectangle(picture, (0, _TOP_PX), (frame.width - 1, frame.height + _TOP_PX - 1), _INK, 1)
-
-
-def _bars(picture: Image, frame: _Frame, result: IntrinsicsResult, sightings: Sequence[Sighting]) -> None:
-    rms = result.view_rms_px
-    left, width = frame.width + 16, _SIDE_PX - 32
-    step = min(26.0, (frame.height - 10) / len(rms))
-    longest = max(max(rms), 1e-9)
-    for k, (value, sighting, used) in enumerate(zip(rms, sightings, result.used, strict=True)):
-        top = round(_TOP_PX + k * step)
-        high = max(round(step) - 2, 1)
-        colour = (225, 200, 170) if used.mean() > 0.5 else (190, 190, 240)
-        cv2.rectangle(picture, (left, top), (left + round(width * value / longest), top + high), colour, -1)
-        if step >= 13.0:
-            text = f"{value:.3f}  {Path(sighting.name).name}"[:44]
-            write(picture, text, (left + 4, top + high - 5), 0.4)
-
-
-def _titles(
-    picture: Image, frame: _Frame, result: IntrinsicsResult, sightings: Sequence[Sighting], enlarged: float
-) -> None:
-    out = sum(int((~u).sum()) for u in result.used)
-    total = sum(len(s) for s in sightings)
-    lines = (
-        f"{result.model}, {len(sightings)} views, {total - out} points, {result.rms_px:.3f} px; {out} left out (red)",
-        f"residuals {enlarged:.0f} times enlarged; cross: principal point; tinted: no point seen there",
-    )
-    for k, text in enumerate(lines):
-        write(picture, text, (8, 24 + 24 * k), 0.55)
-    write(picture, "rms of each view (px)", (frame.width + 16, 48), 0.55)
-
-
-def write(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> None:
-    """Write a text that begins at a place (px)."""
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
-
-
-def line(image: Image, start: Array, end: Array, colour: _Colour, width: int = 1) -> None:
-    """Draw a line between two places (2,), px."""
-    first, last = (np.rint(point * 2**_SUBPIXEL_BITS).astype(int).tolist() for point in (start, end))
-    cv2.line(image, first, last, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def disc(image: Image, at: Array, radius: float, colour: _Colour) -> None:
-    """Draw a filled disc at a place (2,), px."""
-    x, y = (round(v * 2**_SUBPIXEL_BITS) for v in at.tolist())
-    cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

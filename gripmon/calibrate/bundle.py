@@ -204,6 +204,19 @@ class BundleProblem:
                 side[places] += np.einsum("nia,ni->na", weighted, values[good])
         return normal, side
 
+    def of_shape(self, parameters: Array, cam_T_plate: Array, used: NDArray[np.bool_]) -> Equations:
+        """The normal equations of a single view in the free parameters and the displacements of the target's points,
+        without their prior: its pose is eliminated.
+        """
+        at = parameters, [cam_T_plate], np.zeros_like(self._information)
+        self._correct_discs(at)
+        normal, side = self._equations(at, [used.astype(float)])
+        p, prior = self._free.shape[1], np.concatenate([np.zeros(self._free.shape[1]), self._information.ravel()])
+        pose, rest = slice(p, p + 6), np.r_[:p, p + 6 : len(normal)]
+        through = np.linalg.solve(normal[pose, pose], np.column_stack([normal[pose, rest], side[pose]]))
+        across, alone = normal[rest, pose], normal[np.ix_(rest, rest)] - np.diag(prior)
+        return alone - across @ through[:, :-1], side[rest] - across @ through[:, -1]
+
     def normal_matrix(self, parameters: Array, cam_T_plate: Array) -> Array:
         """(p + 6, p + 6) of a single view with all its points: free parameters, then the pose."""
         at = parameters, [cam_T_plate], np.zeros((0, 3))
@@ -274,6 +287,26 @@ class BundleProblem:
             at[0], tuple(at[1]), covariance, tuple(self._residuals(at)), tuple(used), float(np.sqrt(variance)), freedom,
             at[2],
         )  # fmt: skip
+
+
+LARGEST_RMS_SHARE = 0.003
+"""Root mean square residual over the image's width above which no camera of the model fits at all."""
+USELESS_FOCAL = 0.2
+"""Relative standard deviation of the focal length above which there is no calibration."""
+
+
+def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
+    """Reject a fit that is not a calibration: :class:`CalibrationError`."""
+    if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
+        raise CalibrationError(
+            f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "
+            "one camera and focus, the target as it was described, or another model"
+        )
+    moves_focal = np.flatnonzero(free[0])
+    if len(moves_focal):
+        share = float(np.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]])) / bundle.parameters[0]
+        if share > USELESS_FOCAL:
+            raise CalibrationError(DEGENERATE)
 
 
 DEGENERATE = (

@@ -14,12 +14,11 @@ from gripmon.calibrate.bundle import BundleProblem
 from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult, calibrate, doubts_of
 from gripmon.calibrate.lens_models import PINHOLE, LensModel, lens_vector
 from gripmon.calibrate.plate_pose import plate_pose_start
-from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.target_shape import CHANCE, FEWEST_VIEWS
 
 
 def cross_validate(
-    sightings: Sequence[Sighting],
     whole: IntrinsicsResult,
     *,
     fixed: Fixed = MappingProxyType({}),
@@ -29,6 +28,7 @@ def cross_validate(
     """Views that are left out of the calibration, a part of all at a time, with only their own pose fitted; without an
     answer for fewer than four views.  ``whole``: the calibration from all of them, with the same values ``fixed``.
     """
+    sightings = whole.sightings
     folds = min(folds, len(sightings))
     squares, count = 0.0, 0
     cameras: list[IntrinsicsResult] = []
@@ -82,9 +82,7 @@ def _scatter(whole: IntrinsicsResult, without: Sequence[IntrinsicsResult]) -> di
     return {name: math.sqrt(ratio) for name, ratio in ratios.items() if ratio > limit}
 
 
-def with_scatter(
-    result: IntrinsicsResult, found: CrossValidation, sightings: Sequence[Sighting]
-) -> IntrinsicsResult:
+def with_scatter(result: IntrinsicsResult, found: CrossValidation) -> IntrinsicsResult:
     """The result with what its cross-validation shows: where parts of the views differ more than their errors allow, a
     covariance that covers it, and a warning.
     """
@@ -96,8 +94,8 @@ def with_scatter(
         f"fits without some of the views differ more than their errors allow ({name} {times:.1f} times): all ± are "
         "enlarged to cover it; more views, tilted to all sides, of a flat target"
     )
-    doubts = doubts_of(result, sightings)
+    doubts = doubts_of(result)
     result = replace(
         result, covariance=times**2 * result.covariance, warnings=tuple(w for w in result.warnings if w not in doubts)
     )
-    return replace(result, warnings=(*result.warnings, wrong, *doubts_of(result, sightings)))
+    return replace(result, warnings=(*result.warnings, wrong, *doubts_of(result)))

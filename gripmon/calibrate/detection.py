@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import cv2
 import msgspec
@@ -28,6 +27,7 @@ from gripmon.model.targets import (
     StaggeredCircles,
     Target,
     name_of,
+    turns_alike,
 )
 
 CORNER_RADIUS = 0.42
@@ -45,7 +45,9 @@ BLURRED_PX = 3.0
 def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
     """Points of the target in an image (of any type that a camera delivers), or why there are none.
 
-    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  :class:`TargetError` for an
+    On a part of a chequerboard or of a lattice of discs any point may be the origin: nothing marks one.  A whole board
+    with an odd and an even number of corners is numbered so that the square between its first corners along both axes
+    is dark.  :class:`TargetError` for an
     impossible target (an unknown dictionary).
     """
     grey = to_grey(image)
@@ -76,7 +78,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     window = np.minimum(CORNER_RADIUS, 1.3 * margin) * steps - (1.0 if 1.3 * margin < CORNER_RADIUS else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
-    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"], True)
+    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"], 1)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
@@ -93,12 +95,16 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     if blur_px > TOO_BLURRED * float(np.median(steps)):
         return NotFound(_too_coarse(blur_px, steps))
     cells = _turned(cells, target.columns, target.rows)
+    turns = turns_alike(target) if _whole(cells, target.columns, target.rows) else 0
+    if turns == 1 and (upright := by_colours(grey, cells, rough)) is not None:
+        cells = upright
+    elif turns == 1:
+        turns = 2
     uv_px, covariance, good = _sharp(grey, rough, CORNER_RADIUS * steps, cells)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
-    whole = _whole(cells, target.columns, target.rows)
     fewest = FEWEST["chequerboard"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, fewest, whole)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, fewest, turns)
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
@@ -126,10 +132,10 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
     covariance = np.array([np.eye(2) if centre is None else centre[1] for centre in centres])
     plate = np.concatenate([places * target.step_m, np.zeros((len(cells), 1))], axis=1)
-    whole = _whole(places, *(max(each) + 1 for each in zip(*target.places, strict=True)))
+    turns = turns_alike(target) if _whole(places, *(last + 1 for last in target.last)) else 0
     radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), len(target.places), blur_px)
     fewest = FEWEST["circles"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, fewest, whole)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, fewest, turns)
 
 
 def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGrid) -> NDArray[np.intp] | NotFound:
@@ -172,12 +178,12 @@ def _sighting(
     name: str,
     note: str,
     fewest: int,
-    anchored: bool,
+    turns: int,
 ) -> Sighting | NotFound:
     if good.sum() < fewest:
         return NotFound(f"{int(good.sum())} points of the target are sharp and free; at least {fewest}")
     size = (grey.shape[1], grey.shape[0])
-    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note, anchored)
+    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note, turns)
 
 
 def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
@@ -206,11 +212,12 @@ def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str, ends: bool) -> NotFound:
+    short, long = sorted((cells.max(axis=0) + 1).tolist())
+    larger = long > max(columns, rows) or short > min(columns, rows)
     # The longer side first, as in the target.
-    seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
-    larger = max(seen) > max(columns, rows) or min(seen) > min(columns, rows)
-    wrong = f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}"
-    return NotFound(wrong, larger, ends and not larger)
+    seen = f"{long} x {short}" if columns >= rows else f"{short} x {long}"
+    wrong = f"the target shows {seen} {what}; it should have {columns} x {rows}"
+    return NotFound(wrong, larger, (long, short) if ends and not larger else None)
 
 
 def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:
@@ -332,31 +339,21 @@ def _levels(grey: Grey, where: Array) -> Array:
     return np.asarray(out[0], np.float64)
 
 
-def upright(image: Image, sighting: Sighting, board: Chequerboard) -> Sighting | NotFound:
-    """``sighting`` of a whole board with one odd and one even number of corners, rotated so that the square between its
-    first corners along both axes is dark.  :class:`NotFound` if part of the board is hidden (then the lattice's origin
-    is unknown), or if the colours are ambiguous.
+def by_colours(grey: Grey, cells: NDArray[np.intp], at: Array) -> NDArray[np.intp] | None:
+    """The corners (n, 2) of a whole board with one odd and one even number of them, which lie at (n, 2) px, rotated so
+    that the square between the first ones along both axes is dark; None where the colours don't tell.
     """
-    count = board.columns * board.rows
-    if len(sighting) != count:
-        return NotFound(f"{len(sighting)} of the board's {count} corners; all of them, to tell which way up it is")
-    cells = np.rint(sighting.plate_m[:, :2] / board.square_m).astype(int)
-    cells -= cells.min(axis=0)
-    if tuple(cells.max(axis=0) + 1) == (board.rows, board.columns):  # x along the columns
-        cells = np.stack([cells[:, 1], board.rows - 1 - cells[:, 0]], axis=1)
-    if tuple(cells.max(axis=0) + 1) != (board.columns, board.rows):
-        return NotFound("the corners aren't the whole board; all of them, to tell which way up it is")
-    places = np.empty((board.columns, board.rows, 2))
-    places[cells[:, 0], cells[:, 1]] = sighting.uv_px
+    last = cells.max(axis=0)
+    places = np.full((*(last + 1), 2), np.nan)
+    places[cells[:, 0], cells[:, 1]] = at
     # The centre of a square from its four corners: perspective and lens hardly distort one square.
     middles = 0.25 * (places[:-1, :-1] + places[1:, :-1] + places[:-1, 1:] + places[1:, 1:])
-    grey = to_grey(image)
-    levels = grey[tuple(np.rint(middles[..., k]).astype(int) for k in (1, 0))].astype(np.float64)
-    even = np.indices(levels.shape).sum(axis=0) % 2 == 0
+    shown = np.isfinite(middles).all(axis=2)
+    levels = grey[tuple(np.rint(middles[shown][:, k]).astype(int) for k in (1, 0))].astype(np.float64)
+    even = np.indices(shown.shape).sum(axis=0)[shown] % 2 == 0
+    if even.all() or not even.any():
+        return None
     difference = float(np.median(levels[even]) - np.median(levels[~even]))
     if abs(difference) <= LEAST_CONTRAST * float(np.ptp(levels)):
-        return NotFound("dark and light squares don't tell which way up the board is; a board in even light")
-    if difference > 0.0:
-        cells = [board.columns - 1, board.rows - 1] - cells
-    plate_m = np.concatenate([cells * board.square_m, np.zeros((count, 1))], axis=1)
-    return replace(sighting, plate_m=plate_m)
+        return None
+    return last - cells if difference > 0.0 else cells

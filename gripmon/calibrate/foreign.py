@@ -7,12 +7,16 @@ import functools
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+
 from gripmon.model.errors import InputError
+from gripmon.model.geometry import UNIT_TOLERANCE, make_transform, rotation_from_xyzw
+from gripmon.model.records import Array
 from gripmon.model.yaml_text import YamlFault, parse_yaml
 
 Pinhole = tuple[float, float, float, float]
@@ -41,7 +45,7 @@ class FileValues:
     path: str = ""
 
     def fault(self, key: str, wrong: str, right: str = "") -> InterchangeError:
-        return InterchangeError(self.file, self.path + key, wrong, right or self.right)
+        return InterchangeError(self.file, (self.path + key).rstrip(":. "), wrong, right or self.right)
 
     def value(self, key: str, right: str = "") -> Any:
         if key not in self.content:
@@ -86,6 +90,15 @@ class FileValues:
             if number != int(number):
                 raise self.fault(key, f"{shown(number)} is not a whole number", "a number of pixels")
         return int(found[0]), int(found[1])
+
+    def pose(self, shift: Sequence[float], quaternion: Sequence[float]) -> Array:
+        """A transform (4, 4); the quaternion x, y, z, w has to be of unit length."""
+        length = math.hypot(*quaternion)
+        if abs(length - 1.0) > UNIT_TOLERANCE:
+            hint = " (degrees?)" if max(map(abs, quaternion)) > 1.5 else ""
+            raise self.fault("", f"its quaternion has length {length:.4g}{hint}", "a unit quaternion x y z w")
+        x, y, z, w = quaternion
+        return make_transform(rotation_from_xyzw((x, y, z, w)), np.array(shift))
 
     def flag(self, key: str, otherwise: bool) -> bool:
         """True or false, also in quotes, as some programs write it; ``otherwise`` if there is none."""
@@ -138,13 +151,6 @@ def shown(value: Any) -> str:
     """A value for a message, shortened if it is long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def number_text(value: float) -> str:
-    """The shortest text that reads back as the same number, also in YAML 1.1: ``1.0e-05``."""
-    text = repr(float(value))
-    mantissa, e, exponent = text.partition("e")
-    return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else text
 
 
 def read_mapping(file: str, text: str, right: str) -> dict[str, Any]:

@@ -18,10 +18,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.calibrate.foreign import number_text
 from gripmon.calibrate.hand_eye_formats import TCP_FRAME
 from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.records import Array, Transform
+from gripmon.model.yaml_text import as_yaml
 
 HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
 _FRAME = re.compile(r"[^/\s\"'<>&][^\s\"'<>&]*")
@@ -107,25 +107,24 @@ def _easy_handeye2(hand_eye: HandEye, notes: Sequence[str]) -> str:
     if hand_eye.gripper_in_camera:
         raise ValueError("an easy_handeye2 file has the camera in the effector's frame; without --gripper-in-camera")
     translation, rotation = _parts(hand_eye)
-    lines = [
-        *(f"# {note}" for note in notes),
-        "parameters:",
-        f"  name: {json.dumps(hand_eye.name)}",
-        "  calibration_type: eye_in_hand",
-        f"  robot_base_frame: {json.dumps(hand_eye.robot_base_frame)}",
-        f"  robot_effector_frame: {json.dumps(hand_eye.gripper_frame)}",
-        f"  tracking_base_frame: {json.dumps(hand_eye.camera_frame)}",
-        f"  tracking_marker_frame: {json.dumps(hand_eye.tracking_marker_frame)}",
-        "  freehand_robot_movement: true",
-        "  move_group_namespace: /",
-        "  move_group: manipulator",
-        "transform:",
-        "  translation:",
-        *(f"    {axis}: {number_text(v)}" for axis, v in zip("xyz", translation, strict=True)),
-        "  rotation:",
-        *(f"    {axis}: {number_text(v)}" for axis, v in zip("xyzw", rotation, strict=True)),
-    ]
-    return "\n".join(lines) + "\n"
+    content = {
+        "parameters": {
+            "name": hand_eye.name,
+            "calibration_type": "eye_in_hand",
+            "robot_base_frame": hand_eye.robot_base_frame,
+            "robot_effector_frame": hand_eye.gripper_frame,
+            "tracking_base_frame": hand_eye.camera_frame,
+            "tracking_marker_frame": hand_eye.tracking_marker_frame,
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": {
+            "translation": dict(zip("xyz", translation, strict=True)),
+            "rotation": dict(zip("xyzw", rotation, strict=True)),
+        },
+    }
+    return "".join(f"# {note}\n" for note in notes) + as_yaml(content)
 
 
 def _json(hand_eye: HandEye, notes: Sequence[str]) -> str:

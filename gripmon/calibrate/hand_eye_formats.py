@@ -17,7 +17,6 @@ from gripmon.calibrate.static_transforms import (
     FIXED,
     QUATERNION,
     FramePair,
-    checked_pose,
     from_angles,
     published_transforms,
 )
@@ -222,14 +221,14 @@ def _easy_handeye(values: FileValues) -> FramePair:
     else:
         shift, turn = (values.below("transform").below(part) for part in ("translation", "rotation"))
         keys = ("x", "y", "z", "w")
-    pose = checked_pose(turn, [shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
+    pose = turn.pose([shift.number(axis) for axis in "xyz"], [turn.number(key) for key in keys])
     return FramePair("easy_handeye" if first else "easy_handeye2", frames[0], frames[1], lambda: pose, frames[1])
 
 
 def _own_json(values: FileValues) -> FramePair:
     part = values.below("cam_T_grip")
     shift = part.numbers("translation_m", (3,), "x, y, z")
-    pose = checked_pose(part, shift, part.numbers("rotation_xyzw", (4,), "x, y, z, w"))
+    pose = part.pose(shift, part.numbers("rotation_xyzw", (4,), "x, y, z, w"))
     parent, child = (str(values.value(f"{name}_frame")) for name in ("parent", "child"))
     matrix = values.below("parent_T_child").numbers("matrix", (16,), "4 x 4 numbers")
     # With --gripper-in-camera, the camera's frame is the parent.

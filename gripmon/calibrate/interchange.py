@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from gripmon.calibrate.foreign import InterchangeError, number_text
+from gripmon.calibrate.foreign import InterchangeError
 from gripmon.model.camera import BrownConradyLens, Camera, LensSettings, make_camera
 from gripmon.model.lenses import BrownMap
 from gripmon.model.records import Array
+from gripmon.model.yaml_text import as_yaml
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0
@@ -87,8 +90,13 @@ def _nearest(camera: LensSettings, kind: str, file: str, fit: bool) -> tuple[Len
     return fitted.camera, f"the lens was {camera.__struct_config__.tag}; this is the nearest Brown-Conrady, {off}"
 
 
-def _list_text(values: Sequence[float]) -> str:
-    return "[" + ", ".join(map(number_text, values)) + "]"
+def _commented(notes: Sequence[str], content: dict[str, Any]) -> bytes:
+    return ("".join(f"# {note}\n" for note in notes) + as_yaml(content, inline=True)).encode()
+
+
+def _matrix(values: NDArray[Any]) -> dict[str, Any]:
+    """Of two dimensions, as ROS writes it."""
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
 
 
 def _write_ros(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
@@ -101,41 +109,36 @@ def _write_ros(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
         coefficients += [0.0] * (5 - len(coefficients))
     else:
         model = "rational_polynomial"
-    fx, fy, cx, cy = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+    matrix = _pinhole(camera)
+    content = {
+        "image_width": camera.width_px,
+        "image_height": camera.height_px,
+        "camera_name": name,
+        "camera_matrix": _matrix(matrix),
+        "distortion_model": model,
+        "distortion_coefficients": _matrix(np.array([coefficients])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.column_stack([matrix, np.zeros(3)])),
+    }
+    return _commented(notes, content)
 
-    def matrix(key: str, rows: int, columns: int, data: list[float]) -> list[str]:
-        return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: {_list_text(data)}"]
 
-    lines = [
-        *(f"# {note}" for note in notes),
-        f"image_width: {camera.width_px}",
-        f"image_height: {camera.height_px}",
-        f"camera_name: {name}",
-        *matrix("camera_matrix", 3, 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1]),
-        f"distortion_model: {model}",
-        *matrix("distortion_coefficients", 1, len(coefficients), coefficients),
-        *matrix("rectification_matrix", 3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1]),
-        *matrix("projection_matrix", 3, 4, [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
-    ]
-    return ("\n".join(lines) + "\n").encode()
+def _pinhole(camera: LensSettings) -> Array:
+    return np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
 
 
 def _write_kalibr(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
     """One camera, ``cam0``."""
-    model = "equidistant" if camera.__struct_config__.tag == "fisheye" else "radtan"
-    coefficients = camera.coefficients[:4]  # type: ignore[union-attr]  # a fifth is zero
-    lines = [
-        *(f"# {note}" for note in notes),
-        "cam0:",
-        "  cam_overlaps: []",
-        "  camera_model: pinhole",
-        f"  distortion_coeffs: {_list_text(coefficients)}",
-        f"  distortion_model: {model}",
-        f"  intrinsics: {_list_text((camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))}",
-        f"  resolution: [{camera.width_px}, {camera.height_px}]",
-        f"  rostopic: /{name}/image_raw",
-    ]
-    return ("\n".join(lines) + "\n").encode()
+    content = {
+        "cam_overlaps": [],
+        "camera_model": "pinhole",
+        "distortion_coeffs": list(camera.coefficients[:4]),  # type: ignore[union-attr]  # a fifth is zero
+        "distortion_model": "equidistant" if camera.__struct_config__.tag == "fisheye" else "radtan",
+        "intrinsics": [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px],
+        "resolution": [camera.width_px, camera.height_px],
+        "rostopic": f"/{name}/image_raw",
+    }
+    return _commented(notes, {"cam0": content})
 
 
 def _write_mrcal(camera: LensSettings, notes: Sequence[str], name: str) -> bytes:
@@ -174,10 +177,7 @@ def _write_opencv(camera: LensSettings, notes: Sequence[str], name: str, suffix:
     storage.write("image_width", camera.width_px)
     storage.write("image_height", camera.height_px)
     storage.write("fisheye_model", int(camera.__struct_config__.tag == "fisheye"))
-    storage.write(
-        "camera_matrix",
-        np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]]),
-    )
+    storage.write("camera_matrix", _pinhole(camera))
     storage.write("distortion_coefficients", np.array([camera.coefficients]).T)  # type: ignore[union-attr]
     return storage.releaseAndGetString().encode()
 

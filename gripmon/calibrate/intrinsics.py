@@ -15,13 +15,13 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
-from gripmon.calibrate.bundle import DEGENERATE, Bundle, BundleProblem, ContradictionError, Effort, merit
+from gripmon.calibrate.bundle import DEGENERATE, Bundle, BundleProblem, ContradictionError, Effort, check_fit, merit
 from gripmon.calibrate.lens_models import LensModel, ModelName, lens_vector, parameter_names
 from gripmon.calibrate.plate_pose import plate_pose_start
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.calibrate.target_shape import CHANCE, UNEVEN_TARGET, TargetPoints, off_plane_m
+from gripmon.calibrate.target_shape import UNEVEN_TARGET, TargetPoints, off_plane_m
+from gripmon.calibrate.uneven_target import with_shape
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.records import Array
 
@@ -53,7 +53,11 @@ def calibrate(
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
     names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
-    target, bundle, uneven = _of_uneven_target(lens_model, sightings, free, bundle, exact_target)
+    target: TargetPoints | None = None
+    uneven: tuple[str, ...] = ()
+    if not exact_target:
+        shaped, uneven = with_shape(lens_model, sightings, free, bundle, tested=exact_target is None)
+        target, sightings, bundle = shaped or (None, sightings, bundle)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
     poses = range(len(sightings))
@@ -70,37 +74,9 @@ def calibrate(
         criterion={model: _bayes(bundle, p + (0 if target is None else target.unknowns))},
         target=target,
         displacement_m=bundle.displacement_m,
+        sightings=tuple(sightings),
     )
-    return replace(result, warnings=(*held, *uneven, *doubts_of(result, sightings)))
-
-
-def _of_uneven_target(
-    lens_model: LensModel, sightings: Sequence[Sighting], free: Array, bundle: Bundle, exact: bool | None
-) -> tuple[TargetPoints | None, Bundle, tuple[str, ...]]:
-    """The fit with the displacements of the target's points as unknowns, and these points, if the residuals at each of
-    them are so alike in all images that an exact target wouldn't show it; else the fit that it is given.  Where that
-    target's shape can't be estimated, a line that says so: an image that doesn't tell its points would hold them flat.
-    """
-    target = None if exact else TargetPoints.of(sightings)
-    if target is None or bundle.degrees_of_freedom <= target.unknowns:
-        return None, bundle, ()
-    problem = BundleProblem(lens_model, sightings, free, target=target)
-    if exact is None:
-        ratio = problem.gain(bundle) / target.unknowns
-        if fdtrc(target.unknowns, bundle.degrees_of_freedom, ratio) > CHANCE:
-            return None, bundle, ()
-    whole = sum(sighting.anchored for sighting in sightings)
-    if whole < len(sightings):
-        right = f"images that all show it whole, as {whole} of these {len(sightings)} do"
-        return None, bundle, (f"{UNEVEN_TARGET}; the ± leaves that out, its shape could be estimated from {right}",)
-    try:
-        found = problem.solve(bundle.parameters, bundle.cam_T_plate)
-        check_fit(lens_model, found, free)
-        make_camera(lens_model.settings(found.parameters))
-    except (CalibrationError, ValueError):
-        right = "a print on glass or metal is flat"
-        return None, bundle, (f"{UNEVEN_TARGET}, and its shape couldn't be estimated; the ± leaves that out; {right}",)
-    return target, found, ()
+    return replace(result, warnings=(*held, *uneven, *doubts_of(result)))
 
 
 def calibrate_best(
@@ -259,15 +235,11 @@ def _bayes(bundle: Bundle, free: int) -> float:
 
 
 DOUBTFUL_FOCAL = 0.01
-"""Relative standard deviation of the focal length above which there is a warning; and (next) no calibration."""
-USELESS_FOCAL = 0.2
+"""Relative standard deviation of the focal length above which there is a warning."""
 COVERED = 0.6
 """Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
 LARGE_RMS_SHARE = 0.0007
-"""Root mean square residual over the image's width above which a warning calls it large; and (next) above which no
-camera of the model fits at all.
-"""
-LARGEST_RMS_SHARE = 0.003
+"""Root mean square residual over the image's width above which a warning calls it large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +249,8 @@ class IntrinsicsResult:
     ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; all others were held fixed.  One per view:
     ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
     and ``used`` (n,).  ``criterion``: Bayesian information criterion of each model that was tried, the smallest is
-    best.  ``displacement_m`` (m, 3): of the ``target``'s points from their places, if it isn't exact.
+    best.  ``displacement_m`` (m, 3): of the ``target``'s points from their places, if it isn't exact; in its
+    ``sightings`` they are numbered alike then.
     """
 
     model: ModelName
@@ -294,6 +267,7 @@ class IntrinsicsResult:
     cross_validated_rms_px: float | None = None
     target: TargetPoints | None = None
     displacement_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    sightings: tuple[Sighting, ...] = ()
 
     def where_they_are(self, sightings: Sequence[Sighting]) -> Sequence[Sighting]:
         """Views of the same target, with its points where this fit found them."""
@@ -316,23 +290,9 @@ class IntrinsicsResult:
         return dict(zip(parameter_names(self.model), lens_vector(self.camera).tolist(), strict=True))
 
 
-def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
-    """Reject a fit that is not a calibration: :class:`CalibrationError`."""
-    if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
-        raise CalibrationError(
-            f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "
-            "one camera and focus, the target as it was described, or another model"
-        )
-    moves_focal = np.flatnonzero(free[0])
-    if len(moves_focal):
-        share = math.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]]) / bundle.parameters[0]
-        if share > USELESS_FOCAL:
-            raise CalibrationError(DEGENERATE)
-
-
-def doubts_of(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> tuple[str, ...]:
+def doubts_of(result: IntrinsicsResult) -> tuple[str, ...]:
     """What the views can't support, one line each."""
-    return (*_target(result), *_parameters(result), *_views(result, sightings))
+    return (*_target(result), *_parameters(result), *_views(result))
 
 
 def _target(result: IntrinsicsResult) -> list[str]:
@@ -362,10 +322,10 @@ def _parameters(result: IntrinsicsResult) -> list[str]:
     ]
 
 
-def _views(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> list[str]:
+def _views(result: IntrinsicsResult) -> list[str]:
     out = []
     half_px = 0.5 * np.array([result.camera.width_px, result.camera.height_px])
-    reach = max(float(np.linalg.norm(s.uv_px - half_px, axis=1).max()) for s in sightings)
+    reach = max(float(np.linalg.norm(s.uv_px - half_px, axis=1).max()) for s in result.sightings)
     if reach < COVERED * float(np.linalg.norm(half_px)):
         out.append(
             f"no point lies farther than {100.0 * reach / float(np.linalg.norm(half_px)):.0f} % of the way from the "
@@ -382,7 +342,7 @@ def _views(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> list[str]
             f"residuals of {result.rms_px:.2g} px are large: is the target flat, the focus fixed, the model right?"
         )
     rms = result.view_rms_px
-    for sighting, value in zip(sightings, rms, strict=True):
+    for sighting, value in zip(result.sightings, rms, strict=True):
         if value > 3.0 * float(np.median(rms)) and value > 0.1:
             out.append(f"{sighting.name} fits badly: {value:.2g} px, the others {float(np.median(rms)):.2g} px")
     return out

@@ -29,8 +29,8 @@ class Sighting:
     positions on the target, in a right-handed frame with x along its columns and z *into* the plate, away from a camera
     that sees it; z = 0.  On a lattice without markers the origin may be any of its points, and x any of its directions.
     ``disc_radius_m`` is 0 for corners; for discs ``uv_px`` is the centroid of the visible blob, which under perspective
-    isn't the image of the disc's centre.  ``anchored``: ``plate_m`` is of the target's own origin, by its marks, or
-    since all of it is in the image.
+    isn't the image of the disc's centre.  ``turns``: in how many ways ``plate_m`` may lie on the target: one where its
+    marks or colours tell, two or four where all of it looks the same after half a turn or a quarter, 0 (any) of a part.
     """
 
     uv_px: Array
@@ -41,7 +41,7 @@ class Sighting:
     disc_radius_m: float = 0.0
     name: str = ""
     note: str = ""
-    anchored: bool = False
+    turns: int = 0
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -50,9 +50,9 @@ class Sighting:
 @dataclass(frozen=True, slots=True)
 class NotFound:
     """Why no target was found; one line for a person.  ``larger``: one was found, but it has too many points;
-    ``smaller``: one that ends in the image all round, with too few.
+    ``whole``: points along both sides, the longer first, of one that ends in the image all round, with too few.
     """
 
     reason: str
     larger: bool = False
-    smaller: bool = False
+    whole: tuple[int, int] | None = None

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gripmon.calibrate.bundle import DEGENERATE, BundleProblem
-from gripmon.calibrate.intrinsics import USELESS_FOCAL, Fixed, IntrinsicsResult, calibrate, doubts_of, free_parameters
+from gripmon.calibrate.bundle import DEGENERATE, USELESS_FOCAL, BundleProblem
+from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult, calibrate, doubts_of, free_parameters
 from gripmon.calibrate.lens_models import LensModel, ModelName, lens_vector, parameter_names
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.geometry import log_rotation
@@ -45,7 +45,7 @@ def calibrate_single_view(
     )
     if "fx_px" in result.parameters and result.covariance[0, 0] > (USELESS_FOCAL * result.camera.fx_px) ** 2:
         raise CalibrationError(DEGENERATE)
-    return replace(result, warnings=doubts_of(result, [sighting]))
+    return replace(result, warnings=doubts_of(result))
 
 
 def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array, fixed: Fixed) -> list[tuple[Array, Array]]:

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gripmon.calibrate.foreign import Document, FileValues, InterchangeError, shown
-from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.records import Array
 
 _ANGLES, QUATERNION = ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw")
@@ -168,18 +168,10 @@ def _published_pose(values: FileValues) -> Array:
     if any(key in values.content for key in _ANGLES):
         angles = [values.number(key, 0.0) for key in _ANGLES]
         return make_transform(from_angles(*angles), np.array(shift))
-    return checked_pose(values, shift, [values.number(key, float(key == "qw")) for key in QUATERNION])
+    return values.pose(shift, [values.number(key, float(key == "qw")) for key in QUATERNION])
 
 
 def from_angles(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation (3, 3) by angles (rad) about fixed x, y, z, as in URDF."""
     x, y, z = (exp_rotation(angle * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True))
     return z @ y @ x
-
-
-def checked_pose(values: FileValues, shift: Sequence[float], quaternion: Sequence[float]) -> Array:
-    length = float(np.linalg.norm(quaternion))
-    if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise values.fault("", f"its quaternion has length {length:.4g}", "a unit quaternion")
-    x, y, z, w = quaternion
-    return make_transform(rotation_from_xyzw((x, y, z, w)), np.array(shift))

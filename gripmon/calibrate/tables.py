@@ -5,28 +5,24 @@ of them, from columns or from the named images.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.foreign import as_number, read_mapping
+from gripmon.calibrate.foreign import FileValues, read_mapping
 from gripmon.calibrate.plate_pose import plate_pose, pose_slopes
 from gripmon.calibrate.robot_world import FARTHEST_M, check_target_scale
-from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.sighting import CalibrationError, NotFound
 from gripmon.model.csv_rows import csv_rows, read_text
 from gripmon.model.errors import InputError, input_errors
-from gripmon.model.geometry import UNIT_TOLERANCE, exp_rotation, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.images import check_size, image_in
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.records import Array, Image
-from gripmon.model.targets import Chequerboard, Target, TargetError, name_of, refuse_other_size, tells_its_turn
-
-Row = Mapping[str, Any]
+from gripmon.model.targets import Charuco, Target, TargetError, name_of, refuse_other_size, turns_alike
 
 POSITION = ("tx_m", "ty_m", "tz_m")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -36,125 +32,80 @@ POSE_COLUMNS = (
     f"{', '.join(POSITION)} with {', '.join(QUATERNION)} (quaternion) or {', '.join(ROTATION_VECTOR)} (rotation "
     "vector), or m00 … m33 (4 x 4, row by row)"
 )
+_NESTED = "translation_m and rotation_xyzw, or 4 x 4 numbers"
 _ORTHONORMAL = 1e-3
 _TABLE = "a table of samples"
 _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
 
 
-def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list[str]]:
-    """A table's rows, and the place of each for messages; ``right``: what kind of table it should be.
-    :class:`~gripmon.model.errors.InputError` for anything else.
+def rows_of(path: Path) -> list[FileValues]:
+    """A table's rows; their faults name the file and the row.  :class:`~gripmon.model.errors.InputError` for anything
+    else.
     """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
         raise InputError(f"{path}: is not a table; a .csv, .yaml or .json file")
     if suffix == ".csv":
-        places, rows = zip(*csv_rows(path, right), strict=True)
-        return [*rows], [*places]
+        return [FileValues(str(path), row, POSE_COLUMNS, f"{place}: ") for place, row in csv_rows(path, _TABLE)]
     if suffix == ".json":
         try:
-            values = json.loads(read_text(path, right))
+            values = json.loads(read_text(path, _TABLE))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not JSON: {error}; a JSON file") from None
     else:
-        values = read_mapping(str(path), read_text(path, right), _SAMPLES)
+        values = read_mapping(str(path), read_text(path, _TABLE), _SAMPLES)
     samples = values.get("samples") if isinstance(values, dict) else values
     if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
         raise InputError(f"{path}: samples is not a list of samples; {_SAMPLES}")
-    return samples, [f"sample {k + 1}" for k in range(len(samples))]
+    named = [{str(key): value for key, value in sample.items()} for sample in samples]
+    return [FileValues(str(path), row, POSE_COLUMNS, f"sample {k}: ") for k, row in enumerate(named, 1)]
 
 
-def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:
-    """Finite numbers in a row's columns.  ValueError: what is wrong, and what would be right."""
-    out = []
-    for key in keys:
-        value = row.get(key)
-        if value in (None, ""):
-            raise ValueError(f"{place}: has no {key}; a number")
-        if (number := as_number(value)) is None:
-            raise ValueError(f"{place}: {key} is {value!r}; a number")
-        out.append(number)
-    return out
-
-
-def pose_of(row: Row, place: str) -> Array:
-    """``base_T_ee`` (4, 4) of a row.  ValueError: what is wrong, and what would be right."""
-    if row.get("base_T_ee") is not None:
-        return _nested(row["base_T_ee"], place)
-    if any(key in row for key in MATRIX):
-        return checked_transform(np.array(numbers_of(row, MATRIX, place)).reshape(4, 4), place)
-    missing = [key for key in POSITION if key not in row]
+def pose_of(row: FileValues) -> Array:
+    """``base_T_ee`` (4, 4) of a row, in any notation.  :class:`~gripmon.model.errors.InputError`."""
+    if row.content.get("base_T_ee") is not None:
+        return _nested(row)
+    if any(key in row.content for key in MATRIX):
+        return _rigid(row, np.array([row.number(key) for key in MATRIX]).reshape(4, 4))
+    missing = [key for key in POSITION if key not in row.content]
     if missing:
-        other = next((key for key in row if key and key.lower() in ("tx", "x", "x_mm", "tx_mm", "x_m")), None)
+        other = next((key for key in row.content if key.lower() in ("tx", "x", "x_mm", "tx_mm", "x_m")), None)
         found = f" (there is {other}: which unit?)" if other else ""
-        raise ValueError(f"{place}: has no column {missing[0]}{found}; {POSE_COLUMNS}")
-    position = np.array(numbers_of(row, POSITION, place))
-    if any(key in row for key in QUATERNION):
-        return make_transform(_from_quaternion(numbers_of(row, QUATERNION, place), place), position)
-    if any(key in row for key in ROTATION_VECTOR):
-        return make_transform(_from_vector(numbers_of(row, ROTATION_VECTOR, place), place), position)
-    raise ValueError(f"{place}: has no rotation; {POSE_COLUMNS}")
+        raise row.fault("", f"has no column {missing[0]}{found}")
+    shift = [row.number(key) for key in POSITION]
+    if any(key in row.content for key in QUATERNION):
+        return row.pose(shift, [row.number(key) for key in QUATERNION])
+    if not any(key in row.content for key in ROTATION_VECTOR):
+        raise row.fault("", "has no rotation")
+    turn = np.array([row.number(key) for key in ROTATION_VECTOR])
+    angle = float(np.linalg.norm(turn))
+    if angle > 2.0 * np.pi * 1.01:
+        raise row.fault("", f"turns by {angle:.4g} rad, more than once around (degrees?)", "radians")
+    return make_transform(exp_rotation(turn), np.array(shift))
 
 
-def _nested(value: Any, place: str) -> Array:
+def _nested(row: FileValues) -> Array:
     """``{translation_m, rotation_xyzw}`` or a list of four lists of four."""
-    if isinstance(value, Mapping):
-        unknown = set(value) - {"translation_m", "rotation_xyzw"}
-        if unknown or len(value) != 2:
-            raise ValueError(
-                f"{place}: base_T_ee has the keys {', '.join(map(str, value))}; translation_m and rotation_xyzw"
-            )
-        position = _list(value["translation_m"], 3, f"{place}: base_T_ee.translation_m")
-        rotation = _list(value["rotation_xyzw"], 4, f"{place}: base_T_ee.rotation_xyzw")
-        return make_transform(_from_quaternion(rotation, place), np.array(position))
-    if not isinstance(value, list) or len(value) != 4:
-        raise ValueError(f"{place}: base_T_ee is not a transform; translation_m and rotation_xyzw, or 4 x 4 numbers")
-    lines = [_list(line, 4, f"{place}: a row of base_T_ee") for line in value]
-    return checked_transform(np.array(lines), place)
+    if not isinstance(row.content["base_T_ee"], dict):
+        return _rigid(row, np.reshape(row.numbers("base_T_ee", (16,), _NESTED), (4, 4)))
+    pose = row.below("base_T_ee")
+    if pose.content.keys() != {"translation_m", "rotation_xyzw"}:
+        raise row.fault("base_T_ee", f"has the keys {', '.join(map(str, pose.content))}", _NESTED)
+    return pose.pose(pose.numbers("translation_m", (3,), "3 numbers"), pose.numbers("rotation_xyzw", (4,), "4 numbers"))
 
 
-def _list(value: Any, count: int, what: str) -> list[float]:
-    numbers = [as_number(v) for v in value] if isinstance(value, list) else []
-    found = [number for number in numbers if number is not None]
-    if len(numbers) != count or len(found) != count:
-        raise ValueError(f"{what} is {value!r}; {count} numbers")
-    return found
-
-
-def _from_quaternion(quaternion: Sequence[float], place: str) -> Array:
-    length = math.sqrt(sum(q * q for q in quaternion))
-    if abs(length - 1.0) > UNIT_TOLERANCE:
-        hint = " (degrees?)" if max(abs(q) for q in quaternion) > 1.5 else ""
-        raise ValueError(
-            f"{place}: the quaternion {_shown(quaternion)} has the length {length:.4g}{hint}; a unit quaternion x y z w"
-        )
-    x, y, z, w = quaternion
-    return rotation_from_xyzw((x, y, z, w))
-
-
-def _from_vector(vector: Sequence[float], place: str) -> Array:
-    angle = math.sqrt(sum(v * v for v in vector))
-    if angle > 2.0 * math.pi * 1.01:
-        raise ValueError(
-            f"{place}: the rotation vector {_shown(vector)} turns by {angle:.4g} rad, more than once around: degrees? "
-            "radians"
-        )
-    return exp_rotation(np.array(vector))
-
-
-def checked_transform(matrix: Array, place: str) -> Array:
-    """A matrix (4, 4) that is a rigid transform; ValueError otherwise."""
+def _rigid(row: FileValues, matrix: Array) -> Array:
+    """A matrix (4, 4) that is a rigid transform."""
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise ValueError(f"{place}: the last row of the 4 x 4 is {_shown(matrix[3])}; 0 0 0 1 (is it transposed?)")
+        last = " ".join(f"{value:.4g}" for value in matrix[3])
+        raise row.fault("", f"the last row of the 4 x 4 is {last}", "0 0 0 1 (is it transposed?)")
     rotation = matrix[:3, :3]
-    fault = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if fault > _ORTHONORMAL:
-        raise ValueError(
-            f"{place}: the rotation is not orthonormal (off by {fault:.2g}); a rotation matrix, columns of length 1 "
-            "that stand on each other"
-        )
+    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if off > _ORTHONORMAL:
+        wrong = f"the rotation is not orthonormal (off by {off:.2g})"
+        raise row.fault("", wrong, "a rotation matrix, columns of length 1 that stand on each other")
     if np.linalg.det(rotation) < 0.0:
-        raise ValueError(f"{place}: the rotation is left-handed (determinant -1); a right-handed frame")
+        raise row.fault("", "the rotation is left-handed (determinant -1)", "a right-handed frame")
     left, _, right = np.linalg.svd(rotation)
     return make_transform(left @ right, matrix[:3, 3])
 
@@ -166,10 +117,6 @@ def check_scale(base_T_ee: Array) -> None:
         raise ValueError(
             f"the end-effector is {far:.4g} m from the base (median), which no arm reaches: millimetres? metres"
         )
-
-
-def _shown(values: Any) -> str:
-    return " ".join(f"{float(v):.4g}" for v in values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,17 +135,6 @@ class ArmPoses:
     unseen: tuple[str, ...] = ()
 
 
-@dataclass(slots=True)
-class _Found:
-    names: list[str] = field(default_factory=list)
-    arm: list[Array] = field(default_factory=list)
-    target: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    common: list[Array] = field(default_factory=list)
-    images: list[Path] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)
-
-
 def read_arm_poses(
     tables: Sequence[Path],
     camera: GivenCamera | None = None,
@@ -214,55 +150,59 @@ def read_arm_poses(
     """
     if camera is not None and target is not None and not other_target:
         refuse_other_size(target, camera.target)
-    found = _Found()
+    named: list[tuple[str, Array]] = []
+    given: list[Array] = []
+    seen: list[tuple[Array, Array, Array]] = []
+    images: list[Path] = []
+    unseen: list[str] = []
     for path in tables:
-        rows, places = rows_of(path)
+        rows = rows_of(path)
         with progress(len(rows), "pose") as step:
-            for row, place in zip(rows, places, strict=True):
+            for row in rows:
                 step()
-                try:
-                    _take(found, path, row, place, camera, target)
-                except InputError:
-                    raise
-                except ValueError as error:
-                    raise InputError(f"{path}: {error}") from None
-    if not found.arm:
-        raise CalibrationError(f"none of {len(found.unseen)} images shows the target", found.unseen)
-    if found.covariances and len(found.covariances) < len(found.arm):
+                base_T_ee, own = pose_of(row), _of_target(row)
+                if own is not None:
+                    given.append(pose_of(own))
+                else:
+                    images.append(path.parent / _image_of(row))
+                    try:
+                        seen.append(_seen(images[-1], camera, target))
+                    except CalibrationError as error:
+                        unseen.append(f"{images[-1]}: {error}")
+                        continue
+                named.append((f"{path.name}, {row.path.rstrip(': ')}", base_T_ee))
+    if not named:
+        raise CalibrationError(f"none of {len(unseen)} images shows the target", unseen)
+    if given and images:
         raise InputError(f"{tables[0]}: some rows have cam_ columns, others images; one or the other")
-    arm, targets = np.stack(found.arm), np.stack(found.target)
+    names, arm = tuple(name for name, _ in named), np.stack([base_T_ee for _, base_T_ee in named])
+    targets = np.stack(given or [pose for pose, _, _ in seen])
     with input_errors(str(tables[0])):
         check_scale(arm)
         check_target_scale(targets)
-        _check_once(arm, targets, found.names)
-    covariance, common = (np.stack(each) if each else None for each in (found.covariances, found.common))
-    return ArmPoses(tuple(found.names), arm, targets, covariance, common, tuple(found.images), tuple(found.unseen))
+        _check_once(arm, targets, names)
+    covariance, common = (np.stack([each[k] for each in seen]) if seen else None for k in (1, 2))
+    return ArmPoses(names, arm, targets, covariance, common, tuple(images), tuple(unseen))
 
 
-def _take(found: _Found, table: Path, row: Row, place: str, camera: GivenCamera | None, target: Target | None) -> None:
-    hand = pose_of(row, place)
-    own = {key.removeprefix("cam_"): value for key, value in row.items() if key.startswith("cam_")}
-    if own:
-        found.target.append(pose_of(own, f"{place}, cam_"))
-    else:
-        if not row.get("image"):
-            raise ValueError(f"{place}: has neither cam_tx_m … nor image; the target's pose, or an image of it")
-        if camera is None or target is None:
-            raise InputError("images need --camera and --target; both of them")
-        path = table.parent / str(row["image"])
-        found.images.append(path)
-        image = image_in(path)
-        check_size(str(path), image, camera.lens.width_px, camera.lens.height_px)
-        try:
-            pose, covariance, common = target_pose(image, camera, target, str(path))
-        except CalibrationError as error:
-            found.unseen.append(f"{path}: {error}")
-            return
-        found.target.append(pose)
-        found.covariances.append(covariance)
-        found.common.append(common)
-    found.arm.append(hand)
-    found.names.append(f"{table.name}, {place}")
+def _of_target(row: FileValues) -> FileValues | None:
+    """The columns of the target's pose under the names of the arm's; None if there are none."""
+    own = {key.removeprefix("cam_"): value for key, value in row.content.items() if key.startswith("cam_")}
+    return FileValues(row.file, own, row.right, f"{row.path}cam_") if own else None
+
+
+def _image_of(row: FileValues) -> str:
+    if not row.content.get("image"):
+        raise row.fault("", "has neither cam_tx_m … nor image", "the target's pose, or an image of it")
+    return str(row.content["image"])
+
+
+def _seen(path: Path, camera: GivenCamera | None, target: Target | None) -> tuple[Array, Array, Array]:
+    if camera is None or target is None:
+        raise InputError("images need --camera and --target; both of them")
+    image = image_in(path)
+    check_size(str(path), image, camera.lens.width_px, camera.lens.height_px)
+    return target_pose(image, camera, target, str(path))
 
 
 def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "") -> tuple[Array, Array, Array]:
@@ -270,18 +210,21 @@ def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "
     effect of the camera's own independent errors (6, k).  :class:`~gripmon.model.targets.TargetError` for a target
     without a unique orientation, :class:`CalibrationError` for an image that doesn't show it.
     """
-    from gripmon.calibrate.detection import detect, upright  # which takes longer to import than a table to read
+    from gripmon.calibrate.detection import detect  # which takes longer to import than a table to read
 
-    if not tells_its_turn(target):
+    if turns_alike(target) > 1:
         raise TargetError(
             f"{name_of(target)}: an image of it doesn't tell which way up it is, so any pose may be turned by half; a "
             "charuco board, or a chequerboard with one even, one odd number of corners"
         )
     sight = detect(image, target, name)
-    if isinstance(sight, Sighting) and isinstance(target, Chequerboard):
-        sight = upright(image, sight, target)
     if isinstance(sight, NotFound):
         raise CalibrationError(sight.reason)
+    count = target.columns * target.rows
+    if not isinstance(target, Charuco) and len(sight) < count:
+        raise CalibrationError(f"{len(sight)} of the target's {count} points; all of them, to tell which way up it is")
+    if sight.turns != 1:
+        raise CalibrationError("dark and light squares don't tell which way up the board is; a board in even light")
     pose, covariance, _ = plate_pose(camera.lens, sight)
     return pose, covariance, pose_slopes(camera, sight, pose)
 

@@ -41,20 +41,32 @@ class TargetPoints:
     @classmethod
     def of(cls, sightings: Sequence[Sighting]) -> TargetPoints | None:
         """None if too few images tell which point is which."""
-        if sum(s.anchored for s in sightings) < FEWEST_VIEWS:
+        whole = [s for s in sightings if s.turns]
+        if len(whole) < FEWEST_VIEWS:
             return None
-        known = np.unique(np.concatenate([_keys(s.plate_m) for s in sightings if s.anchored]), axis=0)
+        known = np.unique(np.concatenate([_keys(s.plate_m) for s in whole]), axis=0)
         return cls.numbered(sightings, np.concatenate([known * _SAME_M, np.zeros((len(known), 1))], axis=1))
 
     @classmethod
     def numbered(cls, sightings: Sequence[Sighting], places_m: Array) -> TargetPoints:
         """The points of these views among those at known places."""
-        number = {key: i for i, key in enumerate(map(tuple, _keys(places_m).tolist()))}
-        index = tuple(
-            np.array([number.get(tuple(key), -1) if s.anchored else -1 for key in _keys(s.plate_m).tolist()], np.intp)
-            for s in sightings
-        )
-        return cls(places_m, index)
+        unnumbered = cls(places_m, ())
+        index = [unnumbered.numbers(s.plate_m) if s.turns else np.full(len(s), -1, np.intp) for s in sightings]
+        return cls(places_m, tuple(index))
+
+    def numbers(self, plate_m: Array) -> NDArray[np.intp]:
+        """Of the points at these places (n, 3); -1 where it has none."""
+        known = {key: i for i, key in enumerate(map(tuple, _keys(self.places_m).tolist()))}
+        return np.array([known.get(tuple(key), -1) for key in _keys(plate_m).tolist()], np.intp)
+
+    def turned(self, turns: int, number: int) -> Array:
+        """(4, 4): the ``number``-th of so many turns by which the target comes to lie on itself."""
+        angle, middle = 2.0 * np.pi * number / turns, 0.5 * (self.places_m.min(axis=0) + self.places_m.max(axis=0))[:2]
+        cosine, sine = float(np.rint(np.cos(angle))), float(np.rint(np.sin(angle)))
+        out = np.eye(4)
+        out[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        out[:2, 3] = middle - out[:2, :2] @ middle
+        return out
 
     @property
     def unknowns(self) -> int:

@@ -163,8 +163,9 @@ def robot_world(arguments: Arguments) -> None:
     against a fixed target: both unknown transforms together, from the arm's poses and the target's.
     DATA are tables (.csv, .yaml, .json) with one row per pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
     qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with the prefix cam_, or
-    image, in which it is measured with --camera and --target (a charuco board, or a chequerboard with an
-    even and an odd number of corners, wholly in view: others have no unique orientation).
+    image, in which it is measured with --camera and --target (a charuco board, or wholly in view a
+    chequerboard with an even and an odd number of corners or staggered discs in an odd number of rows:
+    others have no unique orientation).
     Turn the hand about at least two axes; ten poses or more are good.
     """
     from gripmon.calibrate.api import calibrate_robot_world

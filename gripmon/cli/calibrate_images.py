@@ -36,7 +36,7 @@ IMAGE...               image file, or folder with images
 --fix NAME[=VALUE]...  hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square
                        pixels) or fx_px=870.5 (at this value); may be repeated
 --out FILE.yaml        file to write
---picture FILE.png     also draw the residuals over the image, and how each view fits
+--report FILE.html     also write a page: the residuals over the image, how each image fits, the parameters
 --force                replace existing files
 --json                 one JSON object instead of text; px, the lens's own units
 """
@@ -44,7 +44,7 @@ IMAGE...               image file, or folder with images
 _INTRINSICS_EXAMPLES = """\
   gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
   gripmon calibrate intrinsics plate/ --target charuco:8x6:0.03:0.022:DICT_4X4_250 --model auto \\
-      --out camera.yaml --picture maps.png
+      --out camera.yaml --report camera.html
   gripmon calibrate intrinsics one.png --target circles:8x8:0.008:0.004 --out camera.yaml
 
 exit codes: 0 written; 2 wrong usage or files; 3 no calibration from these images, with the reason:
@@ -64,23 +64,29 @@ def intrinsics(arguments: Arguments) -> None:
     """
     import cv2
 
-    from gripmon.calibrate.api import calibrate_intrinsics, draw_maps
+    from gripmon.calibrate.api import calibrate_intrinsics
     from gripmon.daemon.targets import target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
 
     cv2.setNumThreads(1)
-    arguments.check_outputs("out", "picture")
+    arguments.check_outputs("out", "report")
     target, fixed, paths = target_of(arguments.target), _fixed(arguments), image_paths(arguments.image)
     found = calibrate_intrinsics(paths, target, model=arguments.model, fixed=fixed, progress=progress_bar)
     note(f"{name}: {reason}" for name, reason in found.not_found.items())
     document = found.document(provenance_of(arguments.command_line(), paths))
-    arguments.save("picture", lambda: draw_maps(found.fit, found.sightings))
+    arguments.save("report", lambda: _page(found, arguments.out.name))
     arguments.save("out", document)
     if arguments.json:
         print(json.dumps({"out": str(arguments.out), **found.values()}, indent=2))
     else:
         print("\n".join([*_summary(found, fixed), f"written: {arguments.out}"]))
+
+
+def _page(found: CameraFromViews, title: str) -> bytes:
+    from gripmon.analyse.lens_page import lens_page  # which takes long to import
+
+    return lens_page(found, title)
 
 
 def _fixed(arguments: Arguments) -> dict[str, float | None]:

@@ -46,7 +46,7 @@ _PARTS: dict[str, Part] = {
 }  # fmt: skip
 """Options that name a file of a project, for which its folder stands."""
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
-_PICTURES = (".png", ".jpg", ".jpeg")
+_ENDINGS = {"picture": (".png", ".jpg", ".jpeg"), "report": (".html",)}
 _LARGEST_SEED = 2**32 - 1
 PORT_OPTIONS = """
 --port N            port of the page (default: any free one)
@@ -209,8 +209,8 @@ class Arguments(argparse.Namespace):
                 raise InputError(f"{option} {path}: is a folder; a file")
             if path.exists() and not getattr(self, "force", True):
                 raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
-            if name == "picture" and path.suffix.lower() not in _PICTURES:
-                raise InputError(f"{option} {path}: has no known ending; .png or .jpg")
+            if path.suffix.lower() not in _ENDINGS.get(name, (path.suffix.lower(),)):
+                raise InputError(f"{option} {path}: has no known ending; {' or '.join(_ENDINGS[name][:2])}")
 
     def save(self, name: str, content: Any) -> None:
         """Write a file atomically, if its option was given: bytes, a calibration as YAML, a picture in the format of

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from gripmon.calibrate.foreign import FileValues
 from gripmon.calibrate.sighting import NotFound
-from gripmon.calibrate.tables import POSITION, QUATERNION, Row, check_scale, numbers_of, pose_of, rows_of
+from gripmon.calibrate.tables import POSITION, QUATERNION, check_scale, pose_of, rows_of
 from gripmon.laser.planning import Plan
 from gripmon.laser.spots import Spot, find_spots, plain_spot
 from gripmon.model.errors import InputError, input_errors
@@ -76,9 +77,9 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     """
     parts = []
     for path in paths:
-        rows, places = rows_of(path)
+        rows = rows_of(path)
         with input_errors(str(path)):
-            parts.append(_from_rows(rows, places, path))
+            parts.append(_from_rows(rows, path))
     if len(parts) == 1:
         return parts[0]
     grouped = [part.groups is not None for part in parts]
@@ -102,21 +103,22 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     return replace(samples, names=tuple(f"{t.name}, {n}" for t, n in zip(tables, samples.names, strict=True)))
 
 
-def _from_rows(rows: Sequence[Row], places: Sequence[str], table: Path) -> Samples:
-    """Samples of a table's rows; ``places`` name each row.  ValueError: "place: what is wrong; what would be right"."""
+def _from_rows(rows: Sequence[FileValues], table: Path) -> Samples:
+    """Samples of a table's rows.  ValueError: "place: what is wrong; what would be right"."""
     if not rows:
         raise ValueError("holds no sample; a row for each spot, better 50 of them")
-    named = [row.get("group") not in (None, "") for row in rows]
-    images, off = ([_text(row.get(key)) for row in rows] for key in ("image", "laser_off"))
+    places = [row.path.rstrip(": ") for row in rows]
+    named = [row.content.get("group") not in (None, "") for row in rows]
+    images, off = ([_text(row.content.get(key)) for row in rows] for key in ("image", "laser_off"))
     folder = table.parent
     samples = Samples(
         names=tuple(image or place for image, place in zip(images, places, strict=True)),
         places=tuple(f"{table}: {image or place}" for image, place in zip(images, places, strict=True)),
-        uv_px=np.array([_spot(row, place) for row, place in zip(rows, places, strict=True)]),
+        uv_px=np.array([_spot(row) for row in rows]),
         images=tuple(None if image is None else folder / image for image in images),
         laser_off=tuple(None if image is None else folder / image for image in off),
-        base_T_ee=np.stack([pose_of(row, place) for row, place in zip(rows, places, strict=True)]),
-        groups=tuple(str(row["group"]) for row in rows) if all(named) else None,
+        base_T_ee=np.stack([pose_of(row) for row in rows]),
+        groups=tuple(str(row.content["group"]) for row in rows) if all(named) else None,
     )
     check_scale(samples.base_T_ee)
     if any(named) and not all(named):
@@ -129,12 +131,11 @@ def _text(value: Any) -> str | None:
     return None if value is None or str(value).strip() == "" else str(value).strip()
 
 
-def _spot(row: Row, place: str) -> tuple[float, float]:
-    if all(row.get(key) not in (None, "") for key in ("u_px", "v_px")):
-        u, v = numbers_of(row, ("u_px", "v_px"), place)
-        return u, v
-    if _text(row.get("image")) is None:
-        raise ValueError(f"{place}: has neither u_px and v_px nor image; the spot in pixels, or the image file's name")
+def _spot(row: FileValues) -> tuple[float, float]:
+    if all(row.content.get(key) not in (None, "") for key in ("u_px", "v_px")):
+        return row.number("u_px"), row.number("v_px")
+    if _text(row.content.get("image")) is None:
+        raise row.fault("", "has neither u_px and v_px nor image", "the spot in pixels, or the image file's name")
     return math.nan, math.nan
 
 

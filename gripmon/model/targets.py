@@ -49,6 +49,16 @@ class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
     rows: _Count
     square_m: _Length
 
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps to the outermost corners along x and along y."""
+        return self.columns - 1, self.rows - 1
+
+    @property
+    def step_m(self) -> float:
+        """Length of these steps."""
+        return self.square_m
+
 
 class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="charuco"):
     """A chequerboard with ArUco markers in white squares; ``columns`` and ``rows`` count *squares*, as OpenCV does."""
@@ -58,6 +68,16 @@ class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field
     square_m: _Length
     marker_m: _Length
     dictionary: str = "DICT_4X4_250"
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps between the outermost inner corners along x and along y."""
+        return self.columns - 2, self.rows - 2
+
+    @property
+    def step_m(self) -> float:
+        """Length of these steps."""
+        return self.square_m
 
 
 class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="circles"):
@@ -202,10 +222,15 @@ def refuse_other_size(target: Target, recorded: str | None, made: str = "the cam
         raise OtherSizeError(f"{name_of(target)}: {made} {name_of(known)}, the same pattern in another size")
 
 
-def tells_its_turn(target: Target) -> bool:
-    """Whether an image shows the target's orientation without ambiguity: by markers, or by the colours of a board with
-    one odd and one even number of corners (:mod:`gripmon.calibrate.detection`).
+def turns_alike(target: Target) -> int:
+    """In how many ways the target can be turned so that an image of all of it looks the same: one with markers, with
+    the colours of a board that has an odd and an even number of corners, with an odd number of staggered rows; else
+    two, or four of a square.
     """
-    if isinstance(target, Chequerboard):
-        return (target.columns + target.rows) % 2 == 1
-    return isinstance(target, Charuco)
+    if isinstance(target, Charuco):
+        return 1
+    if isinstance(target, StaggeredCircles):
+        return 2 - target.rows % 2
+    if isinstance(target, Chequerboard) and (target.columns + target.rows) % 2:
+        return 1
+    return 4 if target.columns == target.rows else 2

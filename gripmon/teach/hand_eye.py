@@ -19,7 +19,7 @@ from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.plane import Coincidence, KnownCorners
 from gripmon.calibrate.plane import calibrate_plane as calibrate_image
-from gripmon.calibrate.plane_average import PlaneCalibration, against, average
+from gripmon.calibrate.plane_average import NOT_IN_COVARIANCE, PlaneCalibration, against, average
 from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
@@ -135,7 +135,9 @@ class HandEyeOnPlate:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (6, 6) of its error: position of the TCP, then rotation, camera axes."""
+        """Covariance (6, 6) of its error by noise, camera and print, not by bevels: position of the TCP, then rotation,
+        camera axes.
+        """
         return self.fit.covariance
 
     @property
@@ -189,6 +191,7 @@ class HandEyeOnPlate:
         out: dict[str, Any] = {
             "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
             "covariance": fit.covariance.ravel().tolist(),
+            "not_in_covariance": NOT_IN_COVARIANCE,
             "rms_m": fit.rms_m,
             "rms_px": fit.rms_px,
             "consistency_p": fit.consistency_p,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def seen(
     radius_m: float = 0.0,
     gross: float = 0.0,
     displacement_m: Array | None = None,
-    anchored: bool = False,
+    turns: int = 0,
 ) -> list[Sighting]:
     """What a camera sees; a part ``gross`` of the points lies up to 30 px off; ``displacement_m`` (63, 3): of the
     plate's points from where they should be.
@@ -71,6 +72,15 @@ def seen(
         covariance = np.tile(noise_px**2 * np.eye(2), (len(uv), 1, 1))
         name = f"view {k}"
         out.append(
-            Sighting(uv, PLATE_M[ok], covariance, np.flatnonzero(ok), size, radius_m, name, anchored=anchored)
+            Sighting(uv, PLATE_M[ok], covariance, np.flatnonzero(ok), size, radius_m, name, turns=turns)
         )
     return out
+
+
+def part_of(view: Sighting, width_m: float, height_m: float) -> Sighting:
+    """The view's points up to there along x and y."""
+    kept = (view.plate_m[:, 0] < width_m + 1e-6) & (view.plate_m[:, 1] < height_m + 1e-6)
+    return replace(
+        view, uv_px=view.uv_px[kept], plate_m=view.plate_m[kept], covariance_px=view.covariance_px[kept],
+        ids=view.ids[kept],
+    )  # fmt: skip

@@ -21,14 +21,14 @@ from gripmon.daemon.teaching import outline_page, page_session, read_inputs
 from gripmon.model.errors import InputError, NoResultError, in_short
 from gripmon.model.targets import OtherSizeError
 from gripmon.teach.messages import BadRequest, EmptyRequest, Request
-from gripmon.teach.page_server import Action, Served, web_files
+from gripmon.teach.page_server import Action, Sandboxed, Served, web_files
 from gripmon.teach.sites import OutlineSite, TeachSite
 
 _Name = Annotated[str, Meta(max_length=40)]
 _Answers = Annotated[dict[_Name, Annotated[str, Meta(max_length=2000)]], Meta(max_length=40)]
 _PICTURES = {
-    VIEW: "image/jpeg", "camera.png": "image/png", "gripper.png": "image/png", "hand_eye.png": "image/png",
-    "target.pdf": "application/pdf",
+    VIEW: "image/jpeg", "camera.html": "text/html; charset=utf-8", "gripper.png": "image/png",
+    "hand_eye.png": "image/png", "target.pdf": "application/pdf",
 }  # fmt: skip
 
 
@@ -115,7 +115,8 @@ class SetupSite:
             return self._monitor.picture(), "image/jpeg"
         name = path.removeprefix("file/")
         if path == f"file/{name}" and name in _PICTURES and (self._project.folder / name).is_file():
-            return (self._project.folder / name).read_bytes(), _PICTURES[name]
+            data = (self._project.folder / name).read_bytes()
+            return Sandboxed(data) if name.endswith(".html") else data, _PICTURES[name]
         return None
 
     def post(self, path: str) -> Action | None:

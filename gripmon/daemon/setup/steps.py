@@ -114,7 +114,7 @@ def own_camera(path: Path) -> bool:
 def _intrinsics(values: Values) -> Plan:
     def command() -> list[str]:
         words = ["gripmon", "calibrate", "intrinsics", "plate", "--target", name_of(target_in(values))]
-        return [*words, *_given(values, "model"), "--out", "camera.yaml", "--picture", "camera.png", "--force"]
+        return [*words, *_given(values, "model"), "--out", "camera.yaml", "--report", "camera.html", "--force"]
 
     def imported() -> list[str]:
         path = values["camera_file"]
@@ -274,7 +274,7 @@ STEPS = (
                   ("intrinsics_by", ("from the images",)), "--model"),
             Field("camera_file", "file", "", "of gripmon, ROS, Kalibr, OpenCV or others", (),
                   ("intrinsics_by", (FROM_FILE,))),
-        ), "camera.png",
+        ), "camera.html",
     ),
     Step(
         "gripper", "Gripper", "What the fingertips look like: inferred from images of the gripper standing on the "

@@ -21,7 +21,7 @@ from gripmon.model.records import Array, Image
 from gripmon.model.targets import Target
 
 CELLS = 12
-"""Number of cells across the image, as in the picture of ``gripmon calibrate intrinsics``."""
+"""Number of cells across the image, as in the page of ``gripmon calibrate intrinsics``."""
 STILL_PX = 0.5
 """Largest motion between two frames (px): even an exposure over the whole time between them is then blurred by a
 standard deviation of only 0.5 / sqrt(12) = 0.14 px, a twentieth of the limit for blurred images."""

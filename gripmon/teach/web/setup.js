@@ -228,9 +228,13 @@ function showResult() {
   redraw($("#output"), output, () => output.map((text) => element("span", `${text}\n`, { class: /\S {2,}\S/.test(text) ? "row" : "" })));
   $("#file").hidden = chosen !== "target" || !card.state.files.includes("target.pdf");
   const image = $("#result img");
+  const page = $("#result a");
   $("#result").hidden = !card.picture || Boolean(state.busy);
   if (card.picture && !state.busy) {
-    if (image.getAttribute("src") !== card.picture) image.setAttribute("src", card.picture);
+    image.hidden = card.picture.includes(".html?");
+    page.hidden = !image.hidden;
+    if (!page.hidden) page.setAttribute("href", card.picture);
+    else if (image.getAttribute("src") !== card.picture) image.setAttribute("src", card.picture);
   }
 }
 
