@@ -27,7 +27,6 @@ OTHERWISE = {
     "simulate/calibration_images.py",
     "daemon/config/recorded.py",  # temporary folders
     "record/rrd.py",  # what is whole of a damaged recording, in one
-    "daemon/teaching/saving.py",
 }
 """Files of the product that write without :mod:`gripmon.model.atomic`, and why they may."""
 
