@@ -162,9 +162,10 @@ def _kept_lines(teaching: Teaching) -> list[str]:
     lines = [f"the monitor over these images: {before.text()}", f"     with what was taught: {after.text()}"]
     lines += [f"     {text}" for text in (after.why(), after.help()) if text]
     if before.median_excess < after.median_excess:
+        absolute = "it includes the reference's error now, and " if after.valid_by.value == "absolute" else ""
         lines.append(
-            "note: the bound is larger than without: an absolute one includes the reference's error now, and an edge "
-            "that moves with its background counts less"
+            f"note: the bound is larger with what was taught ({absolute}an edge that moves with its background counts "
+            "less): leave `taught:` out of the configuration, unless the edges lie elsewhere than the file has them"
         )
     return lines
 
