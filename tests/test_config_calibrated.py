@@ -86,6 +86,17 @@ def test_files_and_sections_say_the_same(folder: Path):
     assert by_files.reference.covariance == COVARIANCE and not by_files.reference.with_gripper
 
 
+def test_a_camera_as_a_configuration_has_it_may_stand_in_a_file_of_its_own(folder: Path):
+    by_calibration = load_config(folder / "arm.yaml")
+    lens = {**sections()["camera"], "model": "paper"}
+    (folder / "lens.yaml").write_text(as_yaml(lens))
+    change(folder / "arm.yaml", lambda v: v.update(camera="lens.yaml"))
+    assert load_config(folder / "arm.yaml").settings == by_calibration.settings
+    (folder / "lens.yaml").write_text(as_yaml({**lens, "fx_px": "wide"}))
+    with pytest.raises(ConfigError, match=r"lens\.yaml: fx_px: "):
+        load_config(folder / "arm.yaml")
+
+
 def test_a_projects_folder_is_its_configuration(folder: Path):
     (folder / ARM).rename(folder / "config.yaml")
     assert load_config(folder).path == folder / "config.yaml"

@@ -15,7 +15,7 @@ from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, Ha
 from gripmon.calibrate.foreign import UnknownFormatError
 from gripmon.daemon.config.robot_file import RobotFile, reference_in
 from gripmon.daemon.config.typed import ConfigError, Fault
-from gripmon.daemon.config.yaml_file import GivenFile, named_file, read_document
+from gripmon.daemon.config.yaml_file import GivenFile, named_file, read_document, read_settings
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
@@ -73,10 +73,14 @@ def _named_reference(config: Path, section: dict[str, Any]) -> tuple[Path, HandE
 
 
 def read_camera(file: Path | GivenFile) -> CameraCalibration:
-    """A calibrated camera, in a file of gripmon calibrate or of another program.  Raises :class:`ConfigError`, for
+    """A calibrated camera, in a file of gripmon calibrate or of another program, or as in a configuration.  Raises :class:`ConfigError`, for
     another program's file :class:`~gripmon.model.errors.InputError`.
     """
     file = file if isinstance(file, GivenFile) else GivenFile(file)
+    if file.is_lens:
+        lens: LensSettings = read_settings(file.path, LensSettings, file.values)  # type: ignore[arg-type]
+        made = provenance_of(f"read from {file.path.name}", [file.input])
+        return CameraCalibration(camera=lens, parameters=(), covariance=(), provenance=made)
     foreign = foreign_camera(file)
     if foreign is not None:
         return foreign

@@ -56,8 +56,16 @@ class GivenFile:
     @property
     def own(self) -> bool:
         """Whether it has a ``schema``, as files of gripmon's have."""
+        return self._has("schema")
+
+    @property
+    def is_lens(self) -> bool:
+        """Whether it is a camera as a configuration has it in its section."""
+        return self._has("fx_px") and not self.own
+
+    def _has(self, key: str) -> bool:
         with contextlib.suppress(InputError):
-            return "schema" in self.document.content
+            return key in self.document.content
         return False
 
     @property
