@@ -20,6 +20,7 @@ from gripmon.analyse.correction import correct
 from gripmon.analyse.page import page
 from gripmon.analyse.pictures import cut_alike
 from gripmon.analyse.plots import Figure
+from gripmon.analyse.summary import paragraph
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -195,6 +196,16 @@ def test_a_displaced_camera_of_which_no_motion_was_reported_is_not_said_to_stand
     summary = only(Run(records(np.tile([0.0, 3e-3, 0.0], (300, 1))))).summary
     assert "No motion of the camera of arm / wrist was reported" in summary and "did not move" not in summary
     assert "It is displaced: when last measured" in summary and "3 mm" in summary
+
+
+def test_a_displacement_that_another_background_would_look_like_may_be_one():
+    """As on stills of a real gripper that nobody touched: a millimetre where steps of seven may be missing."""
+    recording = only(Run(records(np.tile([0.0, 1e-3, 0.0], (300, 1)))))
+    told = paragraph(msgspec.structs.replace(recording, missable_m=0.9e-3))
+    assert "It is displaced: when last measured" in told and "calibration is affected" in told
+    told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3))
+    assert "It may be displaced: when last measured" in told and "calibration may be affected" in told
+    assert "by up to 7.1 mm another background would look the same" in told
 
 
 def test_before_a_motion_nothing_is_affected_by_what_a_frame_cannot_tell():

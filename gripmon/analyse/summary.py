@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.analyse.affected import excess
-from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
+from gripmon.analyse.content import AffectedRange, Displacement, Event, RecordingReport, size
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS
 from gripmon.analyse.words import (
@@ -70,8 +70,15 @@ def paragraph(report: RecordingReport) -> str:
     if not report.running.frames:
         return f"{report.robot} / {report.camera}: no frame could be read, so nothing is known about its camera."
     motions = [event for event in report.events if event.kind in MOTIONS]
-    parts = [missing(report), _motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
+    # Where nothing was reported, and the whole displacement might be backgrounds'.
+    maybe = not motions and _within(report.at_end, report.missable_m)
+    parts = [missing(report), _motions(report, motions), _at_end(report, motions, maybe), _affected(report, maybe)]
+    parts.append(_lost(report))
     return " ".join(part for part in parts if part)
+
+
+def _within(off: Displacement | None, missable_m: float | None) -> bool:
+    return off is not None and missable_m is not None and off.size_m <= missable_m
 
 
 def missing(report: RecordingReport) -> str:
@@ -137,7 +144,7 @@ def _motion(event: Event, first: bool) -> str:
     return f"{start}{by}{within}: {cause_words(event)}."
 
 
-def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
+def _at_end(report: RecordingReport, motions: Sequence[Event], maybe: bool) -> str:
     off = report.at_end
     if off is None or (not motions and not any(a.what == "old_calibration" for a in report.affected)):
         return ""
@@ -148,6 +155,10 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad, off.rotation_sigma_rad)}"
     still = "still " if motions else ""
     text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    if maybe:
+        assert report.missable_m is not None
+        text = text.replace("is displaced", "may be displaced", 1)
+        return f"{text}; by up to {millimetres(report.missable_m)} another background would look the same."
     now = report.at_end_against_reference
     if len(report.references) < 2 or now is None:
         return f"{text}, and there is no new reference."
@@ -158,11 +169,12 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     return f"{text}; the monitor goes by {by}, which {'holds' if held else 'does not hold either'}."
 
 
-def _affected(report: RecordingReport) -> str:
+def _affected(report: RecordingReport, maybe: bool) -> str:
     old = [a for a in report.affected if a.what == "old_calibration"]
     if not old:
         return ""
-    text = f"Work that relied on the initial calibration is affected {_times(old)}"
+    be = "may be" if maybe else "is"
+    text = f"Work that relied on the initial calibration {be} affected {_times(old)}"
     stale = [a for a in report.affected if a.what == "stale_reference"]
     if stale:
         text += f"; work that relied on the reference then in force, {_times(stale)}"
