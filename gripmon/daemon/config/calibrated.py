@@ -73,8 +73,8 @@ def _named_reference(config: Path, section: dict[str, Any]) -> tuple[Path, HandE
 
 
 def read_camera(file: Path | GivenFile) -> CameraCalibration:
-    """A calibrated camera, in a file of gripmon calibrate or of another program, or as in a configuration.  Raises :class:`ConfigError`, for
-    another program's file :class:`~gripmon.model.errors.InputError`.
+    """A calibrated camera, in a file of gripmon calibrate or of another program, or as in a configuration.  Raises
+    :class:`ConfigError`, for another program's file :class:`~gripmon.model.errors.InputError`.
     """
     file = file if isinstance(file, GivenFile) else GivenFile(file)
     if file.is_lens:
