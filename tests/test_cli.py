@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
@@ -312,6 +313,21 @@ def test_a_reader_that_has_seen_enough_is_no_fault(command: str, sequence: Path)
     assert not re.search("Traceback|BrokenPipe|ignored", err)
     helped = command in ("", "check --help")  # argparse takes no notice
     assert process.returncode == (0 if helped else 141)
+
+
+def test_a_command_whose_output_was_closed_by_its_caller_says_its_line_all_the_same():
+    words = " ".join([*GRIPMON, "check", "nothere.yaml"])
+    done = subprocess.run(["bash", "-c", f"{words} >&-"], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 2 and "nothere.yaml" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_path_that_cannot_be_looked_at_is_one_line(capsys: pytest.CaptureFixture[str]):
+    """As one that nobody may search, which the tests' user may."""
+    long = "n" * 300 + ".yaml"
+    for words in (f"check {long}", f"calibrate verify {long} {long}", f"calibrate export {long} --format ros"):
+        with contextlib.suppress(SystemExit):
+            assert main(words.split()) == 2
+        assert "File name too long" in capsys.readouterr().err
 
 
 def test_one_thread_for_linear_algebra_unless_the_user_says_otherwise():

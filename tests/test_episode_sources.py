@@ -26,7 +26,7 @@ from support.episode_files import (
 )
 
 import gripmon
-from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, bags, open_source, settings_for_path
+from gripmon.io.sources import BagSettings, LeRobotSettings, SourceError, open_source, settings_for_path
 from gripmon.io.sources.bags import BagSource
 from gripmon.io.sources.episodes import find_episodes
 from gripmon.model.camera import BrownConradyLens
@@ -99,22 +99,24 @@ def test_messages_of_ros_1(tmp_path: Path, mcap: bool, raw: bool):
     assert source.camera == LENS
 
 
-def test_types_that_only_the_bag_defines(tmp_path: Path):
-    """Foxglove's, as CDR in SQLite, to a process that has read no other bag."""
+@pytest.mark.parametrize("swapped", [False, True])
+def test_types_that_only_the_bag_defines(tmp_path: Path, swapped: bool):
+    """Foxglove's, as CDR in SQLite; another version's fields, by the same name, were read in another order before."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     name, store = "foxglove_msgs/msg/CompressedImage", get_typestore(Stores.ROS2_JAZZY)
-    text = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    fields = ("string frame_id", "uint8[] data", "string format")
+    text = "builtin_interfaces/Time timestamp\n" + "\n".join(fields[::-1] if swapped else fields) + "\n"
     store.register(get_types_from_msg(text, name))
     written = shots(3)
     with Writer(tmp_path / "bag", version=9) as writer:
         connection = writer.add_connection("/wrist/image", name, typestore=store)
         for image, stamp_ns in zip(written.images, written.stamps_ns, strict=True):
             stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NS))
-            message = store.types[name](stamp, "wrist", cv2.imencode(".png", image)[1].ravel(), "png")
+            content = ["wrist", cv2.imencode(".png", image)[1].ravel(), "png"]
+            message = store.types[name](stamp, *(content[::-1] if swapped else content))
             writer.write(connection, stamp_ns, store.serialize_cdr(message, name))
-    bags._types.cache_clear()
     assert_as_written(frames_of(BagSettings(path=str(tmp_path / "bag"))), written, openings=False)
 
 

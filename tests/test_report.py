@@ -206,6 +206,13 @@ def test_a_displacement_that_another_background_would_look_like_may_be_one():
     told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3))
     assert "It may be displaced: when last measured" in told and "calibration may be affected" in told
     assert "by up to 7.1 mm another background would look the same" in told
+    turned = msgspec.structs.replace(recording.at_end, size_m=0.0, rotation_rad=0.09)
+    told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3, at_end=turned))
+    assert "It is displaced" in told and "calibration is affected" in told
+    (old,) = [a for a in recording.affected if a.what == "old_calibration"]
+    far = msgspec.structs.replace(old, largest=msgspec.structs.replace(old.largest, size_m=8e-3))
+    told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3, affected=(far,)))
+    assert "calibration is affected" in told and "may be" not in told
 
 
 def test_before_a_motion_nothing_is_affected_by_what_a_frame_cannot_tell():

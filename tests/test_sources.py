@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -189,6 +190,26 @@ def test_stamps_of_another_unit_are_refused(tmp_path: Path, step: int, per: str)
         FolderSource(FolderSettings(path=str(tmp_path)), Path())
 
 
+def test_microseconds_of_our_days_are_refused_at_any_camera_s_rate(tmp_path: Path):
+    for i in range(4):
+        write(tmp_path, f"{i}.png", picture(i))
+    rows = "".join(f"{i}.png,{1_700_000_000_000_000 + i * 200_000}\n" for i in range(4))
+    (tmp_path / "timestamps.csv").write_text(f"file,stamp_ns\n{rows}")
+    with pytest.raises(SourceError, match=r"stamp_ns rises by 200000 .* more than 1,000 frames/s; nanoseconds"):
+        FolderSource(FolderSettings(path=str(tmp_path)), Path())
+
+
+def test_pixels_of_a_big_tiff_in_the_other_byte_order_are_as_the_sensor_has_them(tmp_path: Path):
+    """Pillow writes none: one strip of 6 x 8 grey pixels, turned by its tag."""
+    image = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    tags = [(256, 8), (257, 6), (258, 8), (259, 1), (262, 1), (273, 16), (274, 3), (277, 1), (278, 6), (279, 48)]
+    entries = b"".join(struct.pack(">HHQ", tag, 3, 1) + struct.pack(">H6x", value) for tag, value in tags)
+    directory = struct.pack(">Q", len(tags)) + entries + struct.pack(">Q", 0)
+    data = b"MM" + struct.pack(">HHHQ", 43, 8, 0, 16 + 48) + image.tobytes() + directory
+    (tmp_path / "a.tif").write_bytes(data)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0], image)
+
+
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("turn", [2, 3, 6, 8])
 def test_pixels_of_a_tiff_are_as_the_sensor_has_them(tmp_path: Path, turn: int, big: bool):
@@ -364,7 +385,7 @@ def test_a_video_that_opencv_can_not_decode_is_read_by_pyav(tmp_path: Path, monk
         assert frame.fault is None and frame.image is not None and frame.image.shape == (*shade.shape, 3)
         assert np.abs(frame.image.mean(axis=2) - shade).mean() < 2.0
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(SourceError, match=r"OpenCV can't decode 'AV01', PyAV can \(.* package av; pip install"):
+    with pytest.raises(SourceError, match=r"OpenCV can't decode this 'AV01', PyAV may \(.* package av; pip install"):
         open_source(VideoSettings(path="a.mp4"), tmp_path)
 
 

@@ -18,6 +18,8 @@ from gripmon.model.records import Array
 
 SIDE_FRAMES, MEAN_FRAMES = 8, 32
 """Frames on each side of a place: by which a change is found; by which its size is judged."""
+FEWEST_FOR_MEANS = 4 * SIDE_FRAMES
+"""Frames from which changes are found by means."""
 FALSE_ALARMS_PER_HOUR = 0.02
 """Less than one in a day of two shifts."""
 MEAN_DOF = 24.0
@@ -68,11 +70,11 @@ def outlier_frames(run: Run) -> Bools:
 def find(run: Run) -> tuple[list[FoundChange], list[FoundChange]]:
     """The change points among the usable frames, in order; and those that are undecided: by no more than two
     backgrounds may differ, so that it was the pose or the background.  A gap before one is part of its interval.
-    Of fewer than four times :data:`SIDE_FRAMES` frames each is compared with the one before it.
+    Of fewer than :data:`FEWEST_FOR_MEANS` frames each is compared with the one before it.
     """
     good, largest = np.flatnonzero(run.usable), largest_background_change(run)
     y = run.y[good]
-    if len(good) < 4 * SIDE_FRAMES:  # too few for means: each frame may be the first after a change
+    if len(good) < FEWEST_FOR_MEANS:  # each frame may be the first after a change
         jumps = (np.diff(y, axis=0) ** 2).sum(axis=1)
         each = [FoundChange(i, i, i) for i in good[1:].tolist()]
         clear = [change for change, jump in zip(each, jumps.tolist(), strict=True) if jump > largest]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
-from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR
+from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR, FEWEST_FOR_MEANS
 from gripmon.analyse.correction import SOURCES, Correction, correct, sample
 from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
 from gripmon.analyse.words import clock_time, count, millimetres
@@ -62,7 +62,9 @@ class CorrectedRun:
             seq = int(self.recording.frames.seq[point.index])
             when = f"{clock_time(point.stamp_ns, 3)} UTC, within {spread_ms:.0f} ms"
             lines.append(f"  frame {seq} ({when}): {size_mm:.3f} mm, {turn_deg:.3f}°")
-        if made.undecided_ns:
+        if made.undecided_ns and len(made.stamp_ns) < FEWEST_FOR_MEANS:
+            lines.append("  too few frames to tell a motion of the camera from another background (σ includes both)")
+        elif made.undecided_ns:
             when = ", ".join(clock_time(stamp_ns, 3) for stamp_ns in made.undecided_ns[:_MAX_SHOWN])
             more = ", …" if len(made.undecided_ns) > _MAX_SHOWN else ""
             lines.append(f"  at {when}{more}: the camera moved, or the background changed (σ includes both)")

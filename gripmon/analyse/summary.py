@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.analyse.affected import excess
-from gripmon.analyse.content import AffectedRange, Displacement, Event, RecordingReport, size
+from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS
 from gripmon.analyse.words import (
@@ -70,15 +70,19 @@ def paragraph(report: RecordingReport) -> str:
     if not report.running.frames:
         return f"{report.robot} / {report.camera}: no frame could be read, so nothing is known about its camera."
     motions = [event for event in report.events if event.kind in MOTIONS]
-    # Where nothing was reported, and the whole displacement might be backgrounds'.
-    maybe = not motions and _within(report.at_end, report.missable_m)
+    maybe = not motions and _explained_by_backgrounds(report)
     parts = [missing(report), _motions(report, motions), _at_end(report, motions, maybe), _affected(report, maybe)]
     parts.append(_lost(report))
     return " ".join(part for part in parts if part)
 
 
-def _within(off: Displacement | None, missable_m: float | None) -> bool:
-    return off is not None and missable_m is not None and off.size_m <= missable_m
+def _explained_by_backgrounds(report: RecordingReport) -> bool:
+    """Whether no displacement is larger than another background would make one look, nor turned past a limit."""
+    largest = [a.largest for a in report.affected if a.what == "old_calibration" and a.largest is not None]
+    off = [*largest, *([] if report.at_end is None else [report.at_end])]
+    return report.missable_m is not None and all(
+        each.size_m <= report.missable_m and excess(0.0, each.rotation_rad or 0.0, report.limits) < 1.0 for each in off
+    )
 
 
 def missing(report: RecordingReport) -> str:

@@ -209,7 +209,8 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             return _run(sys.argv[1:] if arguments is None else arguments)
         finally:  # also of what argparse prints
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed by who started it
+                sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our output has closed it.  Without this Python would report it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

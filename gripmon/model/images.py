@@ -171,7 +171,7 @@ def _not_turned(tiff: bytes) -> bytes:
         return int.from_bytes(tiff[at : at + size], order)
 
     at, wide, entry, value = (8, 8, 20, 12) if number(2, 2) == _BIG_TIFF else (4, 2, 12, 8)
-    at = number(at, 4)
+    at = number(at, at if at == 8 else 4)
     for tag in range(at + wide, at + wide + entry * min(number(at, wide), _MOST_TAGS), entry):
         if number(tag, 2) == _ORIENTATION:
             return tiff[: tag + value] + (1).to_bytes(2, order) + tiff[tag + value + 2 :]

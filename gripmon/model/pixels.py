@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.images import decoded
 from gripmon.model.records import Frame, Image, Refusal
 
 BLUE, GREEN, RED = 0.114, 0.587, 0.299
@@ -90,15 +91,19 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
     return np.asarray(cv2.cvtColor(image, getattr(cv2, pixels.conversion)))
 
 
-def without_mosaic(image: Image, said: str) -> Image:
+def without_mosaic(image: Image, data: bytes, said: str) -> Image:
     """A picture (H, W) in colour if it is a Bayer sensor's mosaic, by the ``format`` of a ``CompressedImage``: that of
     ``compressed_image_transport``, ``bayer_rggb8; png compressed ``, where a conversion before it is named at the end.
+    A file whose ``data`` have colours was converted, whatever it is called.
     """
     encoding, _, how = said.partition(";")
     pixels = ENCODINGS.get(f"{encoding.strip().rstrip('0123456789')}{8 * image.itemsize}")
-    if pixels is None or not encoding.startswith("bayer_") or len(how.split()) > 2 or image.ndim != 2:
+    if pixels is None or not encoding.startswith("bayer_") or len(how.split()) > 2:
         return image
-    return unpacked(image, image.shape[1], pixels)
+    import cv2
+
+    own, _ = decoded(data, cv2.IMREAD_UNCHANGED)
+    return image if own is None or own.ndim != 2 else unpacked(own, own.shape[1], pixels)
 
 
 def in_full_scale(frame: Frame, bit_depth: int) -> Frame:

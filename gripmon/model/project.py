@@ -5,6 +5,7 @@ Commands resolve it as they read their options, so that what is called, and what
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -20,4 +21,5 @@ FILES: dict[Part, str] = {
 def file_of(path: str | Path, part: Part) -> Path:
     """The file that is meant: of a project's folder, the one with its usual name."""
     path = Path(path)
-    return path / FILES[part] if path.is_dir() else path
+    # Of what can't be looked at the reader says why, which Path.is_dir would raise.
+    return path / FILES[part] if os.path.isdir(path) else path  # noqa: PTH112

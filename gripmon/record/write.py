@@ -62,9 +62,9 @@ class ProcessRecorder(Recorder):
     """Records through a separate process.
 
     ``frame`` costs the same for every image size: it keeps a reference to the frame's array (which must not change
-    afterwards) and leaves copying to a thread that wakes every 50 ms.  That thread copies images into shared memory and
-    sends everything else, in batches.  If the recording process can't keep up, first images and then the oldest frames
-    are dropped and counted.  If it dies, it is started again and begins a new file.
+    afterwards) and leaves copying images to a thread that wakes every 50 ms.  That thread copies images into shared
+    memory and sends everything else, in batches.  If the recording process can't keep up, first images and then the
+    oldest frames are dropped and counted.  If it dies, it is started again and begins a new file.
     """
 
     def __init__(

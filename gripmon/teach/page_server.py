@@ -89,10 +89,16 @@ class Site(Protocol):
         ...
 
 
+def _as_list(value: np.ndarray | np.generic) -> Any:
+    """NumPy's arrays and numbers as JSON has them."""
+    return value.tolist()
+
+
 def web_files(page: str) -> dict[str, Served]:
     """The folder ``web`` by the path at which its files are served: ``page`` at the root, and what pages consist of."""
     folder = importlib.resources.files("gripmon.teach") / "web"
-    files = {file.name: (file.read_bytes(), _KINDS[Path(file.name).suffix]) for file in folder.iterdir()}
+    known = [file for file in folder.iterdir() if Path(file.name).suffix in _KINDS]
+    files = {file.name: (file.read_bytes(), _KINDS[Path(file.name).suffix]) for file in known}
     return {"": files[page]} | {name: file for name, file in files.items() if not name.endswith(".html")}
 
 
@@ -155,7 +161,7 @@ class _Http(ThreadingHTTPServer):
     def __init__(self, site: Site, port: int, address: str):
         self.site, self.done = site, threading.Event()
         self.token = secrets.token_urlsafe(_TOKEN_BYTES)
-        self.encode = msgspec.json.Encoder(enc_hook=np.ndarray.tolist).encode
+        self.encode = msgspec.json.Encoder(enc_hook=_as_list).encode
         super().__init__((address, port), _Handler)
         names = {address, "localhost"} if address == ADDRESS else {address}
         self.hosts = frozenset(f"{name}:{self.server_port}" for name in names)

@@ -132,11 +132,16 @@ _OF_ROS = {"cdr": "ROS2_JAZZY", "ros1": "ROS1_NOETIC"}
 """Encodings, and whose types of messages are known beforehand; those we use are the same from Iron to Lyrical."""
 
 
-@functools.cache
-def _types(encoding: str) -> Any:
-    """Raises :class:`SourceError`."""
+@functools.lru_cache(maxsize=64)
+def _types(encoding: str, name: str, definition: str) -> Any:
+    """A store that knows one type as its own recording defines it: another may mean something else by its name.  Raises
+    :class:`SourceError`.
+    """
     typesys = needed("rosbags.typesys")
-    return typesys.get_typestore(typesys.Stores[_OF_ROS[encoding]])
+    store = typesys.get_typestore(typesys.Stores[_OF_ROS[encoding]])
+    if name not in store.types:
+        store.register(typesys.get_types_from_msg(definition, name))
+    return store
 
 
 def _kind(type_name: str) -> str:
@@ -144,11 +149,8 @@ def _kind(type_name: str) -> str:
 
 
 def _of_ros(data: bytes, encoding: str, type_name: str, definition: str) -> Any:
-    from rosbags.typesys import get_types_from_msg
-
-    store, name = _types(encoding), type_name if "/msg/" in type_name else type_name.replace("/", "/msg/")
-    if name not in store.types:
-        store.register(get_types_from_msg(definition, name))
+    name = type_name if "/msg/" in type_name else type_name.replace("/", "/msg/")
+    store = _types(encoding, name, definition)
     return store.deserialize_cdr(data, name) if encoding == "cdr" else store.deserialize_ros1(data, name)
 
 
@@ -317,14 +319,15 @@ class BagSource(Stored):
     def _image(self, message: Any, kind: str) -> tuple[Image | None, str | None]:
         try:
             data = base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
-            if kind == "CompressedVideo" or (kind == "CompressedImage" and VideoDecoder.knows(message.format)):
-                self._decoder = self._decoder or VideoDecoder(message.format)
+            said = str(getattr(message, "format", None) or "")
+            if kind == "CompressedVideo" or (kind == "CompressedImage" and VideoDecoder.knows(said)):
+                self._decoder = self._decoder or VideoDecoder(said)
                 return self._decoder.decode(data)
             if kind == "CompressedImage":
                 image, fault = grey_image(data)
                 if fault == NOT_AN_IMAGE:
-                    fault = f"{fault}: format {message.format!r:.60}; JPEG, PNG, WebP or {VideoDecoder.NAMES}"
-                return (image if image is None else without_mosaic(image, message.format)), fault
+                    fault = f"{fault}: format {said!r:.60}; JPEG, PNG, WebP or {VideoDecoder.NAMES}"
+                return (image if image is None else without_mosaic(image, data, said)), fault
             return message_image(message, data, (int(message.width), int(message.height))), None
         except PayloadError as error:
             return None, str(error)

@@ -28,6 +28,8 @@ TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 MOST_FPS = 10_000
 """Highest frame rate of a recording (1/s)."""
+UNIX_US = range(1_400_000_000_000_000, 2_300_000_000_000_000)
+"""The years 2014 to 2042 in microseconds."""
 
 
 class FolderSettings(
@@ -173,9 +175,11 @@ def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> Non
             raise SourceError(
                 f"{path}: stamp_ns doesn't rise from {earlier} to {later}; stamps that rise in the files' order"
             )
+    # As nanoseconds since a start, times of our days in microseconds are some twenty days.
+    most_fps = MOST_FPS // 10 if rows[names[-1]].stamp_ns in UNIX_US else MOST_FPS
     steps_ns = sorted(rows[later].stamp_ns - rows[earlier].stamp_ns for earlier, later in itertools.pairwise(names))
-    if len(steps_ns) >= 3 and (usual_ns := steps_ns[len(steps_ns) // 2]) < NS_PER_S / MOST_FPS:
-        wrong = f"stamp_ns rises by {usual_ns} from image to image, as of more than {MOST_FPS:,} frames/s"
+    if len(steps_ns) >= 3 and (usual_ns := steps_ns[len(steps_ns) // 2]) < NS_PER_S / most_fps:
+        wrong = f"stamp_ns rises by {usual_ns} from image to image, as of more than {most_fps:,} frames/s"
         raise SourceError(f"{path}: {wrong}; nanoseconds")
 
 
@@ -294,7 +298,7 @@ def _opened_video(path: Path) -> tuple[_Capture, float]:
         if other.grab():
             return other, due_s
     except SourceError as error:
-        raise SourceError(f"path: {path}: OpenCV can't decode {codec!r}, PyAV can ({error})") from None
+        raise SourceError(f"path: {path}: OpenCV can't decode this {codec!r}, PyAV may ({error})") from None
     raise SourceError(f"path: {path} has no frame that can be decoded ({codec!r}); a complete video")
 
 

@@ -73,10 +73,10 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
     step = row if note.step is None else note.step
     if step < row or step % item:
         raise PayloadError(f"step {step}; at least {row} bytes, a multiple of {item}")
-    first = step * note.height
-    if len(payload) != math.ceil(pixels.planes * first):
+    first, more = step * note.height, step * math.ceil((pixels.planes - 1.0) * note.height)
+    if len(payload) != first + more:
         planes = f", and {pixels.planes - 1.0:g} times as many" * (pixels.planes != 1.0)
-        expected = f"{math.ceil(pixels.planes * first)} ({note.height} rows of {step}{planes})"
+        expected = f"{first + more} ({note.height} rows of {step}{planes})"
         raise PayloadError(f"{len(payload)} bytes; {expected}")
     rows = np.frombuffer(payload[:first], f"<{pixels.dtype}").reshape(note.height, step // item)
     return unpacked(rows, note.width, pixels)

@@ -179,7 +179,7 @@ class Ros2Camera(ArrivingCamera):
         if kind == IMAGE:
             image = message_image(message, data, self._size_px)
         elif data.startswith((JPEG, PNG)) and "compressedDepth" not in message.format:
-            image = without_mosaic(file_image(data, self._size_px), message.format)
+            image = without_mosaic(file_image(data, self._size_px), data, message.format)
         else:
             raise PayloadError(f"format {message.format[:40]!r}, first {data[:8].hex() or 'nothing'}; JPEG or PNG")
         stamp_ns = _stamp_ns(message) or arrival.unix_ns
