@@ -26,15 +26,12 @@ from support.taught_scenes import (
 
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper, contents_of
-from gripmon.model.records import Frame
-from gripmon.monitor import Monitor
 from gripmon.simulate.solids import finger_solids
 from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.measure import teach
 from gripmon.teach.play import with_play
 from gripmon.teach.views import TeachingImage, TeachingRefused, Viewer
 from gripmon.teach.visibility import Rig
-from gripmon.track.edges import TaughtEdges
 from gripmon.track.edges.taught import sight_axes
 
 POSE = nominal_cam_T_grip()
@@ -288,23 +285,6 @@ def test_images_with_play_teach_what_images_without_do():
         off_px = PX_PER_M * (np.array(shaken.edges[name].offset_m) - edge.offset_m)
         assert np.abs(off_px).max() < 0.1
         assert max(shaken.edges[name].sigma_m) < 2.0 * max(edge.sigma_m) + 0.05 / PX_PER_M
-
-
-def test_the_play_of_the_images_is_taught_and_no_knock_to_a_monitor():
-    """Without it another place of the play, proved twice, is where the mount was knocked to."""
-    using, levels = reference(None, 1e-3, 1e-2), (150.0, 165.0, 180.0, 195.0, 210.0)
-    taught = taught_from(*with_some_play(BEVEL_M), using=using)
-    assert taught.play == pytest.approx(tuple(PLAY.std(axis=0)), rel=0.05)
-    assert taught_from(*(image_of(BEVEL_M, scene(dn)) for dn in levels), using=using).play == (0.0,) * 6
-    known = taught.reference_offset, taught.reference_covariance
-    for play, knocked in ((taught.play, False), ((0.0,) * 6, True)):
-        edges = TaughtEdges.of(taught.edges, box_gripper(), POSE, OPENING_M, using.covariance, *known, play)
-        monitor = Monitor(CAMERA, box_gripper(), RIG.settings, using, edges)
-        for k in range(12):
-            image = image_of(BEVEL_M, scene(levels[(3 * k) % 5]), moved(POSE, PLAY[k % 5]))
-            monitor.process(Frame(k, k * 10**9, image, OPENING_M))
-        ended = monitor.state().at_reference or ()  # of the first frames, which are averaged until the mount is knocked
-        assert [at.knocked for at in ended] == [True] * knocked
 
 
 def test_an_edge_that_lies_farther_beside_the_others_than_bevels_differ_is_named():

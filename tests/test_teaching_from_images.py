@@ -41,7 +41,7 @@ def test_bounds_of_the_images_taught_from_are_no_larger_than_before(response: Re
     rig = Rig(CAMERA, made.gripper, monitor_settings(response))
     frames = [TeachingImage(image, made.gripper.jaw_nominal_m, f"{k}.png") for k, image in enumerate(images)]
     found = teach(rig, reference, frames)
-    shown = found.reference_offset, found.reference_covariance, found.play
+    shown = found.reference_offset, found.reference_covariance
     own = own_covariance(reference, made.gripper)
     taught = TaughtEdges.of(found.edges, made.gripper, made.cam_T_grip, None, own, *shown)
     before, after = (kept(each, reference, as_frames(frames)).sizes for each in (rig, rig._replace(taught=taught)))

@@ -133,8 +133,6 @@ class Tracker:
         """(k, 6) error of the reference that taught edges have in them, by a standard deviation along k directions."""
         self.taught_offset: Array = np.zeros(6) if taught is None else taught.reference_offset
         """(6,) how far off that reference the gripper appeared in the teaching images."""
-        self.play: Array = np.zeros(6) if taught is None else taught.play
-        """(6,) standard deviations of the mount's play between the teaching images, m and rad."""
         self.taught_digest = "" if taught is None else taught.digest
         """Digest of the taught edges; empty without any."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # as measured last

@@ -68,7 +68,7 @@ class Weigher:
         self._ends, self._lone = EndsEvidence(gripper, tracker.along), has_lone_end(gripper)
         creep = settings.smoothing
         variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month, tracker.play)
+        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month)
         self._possible = Possible(tracker, gripper, settings, from_record(reference.cam_T_grip))
         self._lasting, self._since = self._possible.lasting, since
         self._newest: tuple[Measurement, float, Refits] | None = None

@@ -259,10 +259,7 @@ def _model(
         camera=lens,
         gripper=model,
         reference=msgspec.structs.replace(
-            stated_reference,
-            offset=taught.reference_offset,
-            images_covariance=taught.reference_covariance,
-            play=taught.play,
+            stated_reference, offset=taught.reference_offset, images_covariance=taught.reference_covariance
         ),
         edge_settings=rig.settings.corners.edges,
         edges=taught.edges,
@@ -277,8 +274,6 @@ _HEADER = """\
 #                       along and about the camera's axes (m, rad); every bound includes it
 #   reference.images_covariance  how well the images show where the gripper was, 6 x 6 row by row; with the covariance
 #                       of the configured reference it is what absolute bounds include of the reference's error
-#   reference.play      standard deviation from image to image, by the play of mount and fingers: along and about the
-#                       camera's axes (m, rad); a monitor begins with it, so that play isn't taken for knocks
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
 #                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its

@@ -65,9 +65,8 @@ class Taught:
 
     ``closure_px``: largest distance of the gripper from where it stands when the images are measured with what was
     taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
-    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``play`` (6,):
-    standard deviations of where one image has the gripper from another.  ``left_out``: the images that contradict the
-    others, by their numbers, and why.
+    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``left_out``: the
+    images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -77,7 +76,6 @@ class Taught:
     closure_px: float
     reference_offset: PoseOffset
     reference_covariance: tuple[float, ...]
-    play: PoseOffset
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -182,16 +180,8 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
         round(_closure_px(viewer, images, arrays), 4),
         reference.offset,
         reference.covariance,
-        _spread(images),
         {},
     )
-
-
-def _spread(images: Sequence[TeachingImage]) -> PoseOffset:
-    """Standard deviations of the images' play, as far as they show it; zero where noise explains an image."""
-    play = np.array([np.zeros(6) if image.play is None else image.play for image in images])
-    x, y, z, about_x, about_y, about_z = np.round(play.std(axis=0), 9).tolist()
-    return x, y, z, about_x, about_y, about_z
 
 
 def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:

@@ -132,7 +132,7 @@ class Setup:
         found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
         pose, covariance = from_record(reference.cam_T_grip), own_covariance(reference, self.gripper)
-        shown = found.reference_offset, found.reference_covariance, found.play
+        shown = found.reference_offset, found.reference_covariance
         return found, TaughtEdges.of(found.edges, self.gripper, pose, opening_m, covariance, *shown)
 
 

@@ -73,15 +73,13 @@ class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The reference that was taught at; ``offset``: the perturbation (6,) from it to the gripper in the images, as far
     as bevels don't explain it (m, rad); ``images_covariance`` (36,), 6 x 6 row by row: how well the images alone show
-    where the gripper is, None in files of earlier versions; ``play`` (6,): standard deviations of where one image has
-    it from another (m, rad), by the play of the mount and of the fingers in their holders, 0 where noise explains them.
+    where the gripper is, None in files of earlier versions.
     """
 
     id: str
     cam_T_grip: Transform
     offset: PoseOffset = (0.0,) * 6
     images_covariance: Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)] | None = None
-    play: PoseOffset = (0.0,) * 6
 
 
 class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -208,8 +206,7 @@ class TaughtEdges:
     offsets have in them: one standard deviation along each of k directions, m and rad, given both the reference's own
     covariance and what the teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
-    poses are off by as much if the camera moved since the calibration.  ``play`` (6,): standard deviations of the
-    mount's play between these images, m and rad.
+    poses are off by as much if the camera moved since the calibration.
     """
 
     known: NDArray[np.bool_]
@@ -224,7 +221,6 @@ class TaughtEdges:
     usual_m: Array
     reference_error: Array
     reference_offset: Array
-    play: Array
 
     @classmethod
     def of(
@@ -236,11 +232,10 @@ class TaughtEdges:
         covariance: Sequence[float] | None = None,
         offset: Sequence[float] = (0.0,) * 6,
         images_covariance: Sequence[float] | None = None,
-        play: Sequence[float] = (0.0,) * 6,
     ) -> TaughtEdges:
         """Arrays of edges taught at a pose and a jaw opening; ``covariance``: :func:`own_covariance` of the pose; None
         where it is exact, or only differences from it count; ``offset`` (6,): from it to the gripper in the images, of
-        which ``images_covariance`` says as above how well they show it, None if not at all; ``play`` (6,) as above.
+        which ``images_covariance`` says as above how well they show it, None if not at all.
         """
         listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
         points_grip_m = gripper.points_grip_m(jaw_opening_m)
@@ -264,7 +259,6 @@ class TaughtEdges:
             _usual_m(listed, crease),
             np.zeros((0, 6)) if covariance is None else _error(covariance, images_covariance),
             np.array(offset),
-            np.array(play),
         )
 
     @classmethod
@@ -275,8 +269,7 @@ class TaughtEdges:
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
         opening_m = float(np.mean(openings)) if openings else None
         at, shown = taught_pose(model), model.reference
-        known = shown.offset, shown.images_covariance, shown.play
-        return cls.of(model.edges, gripper, at, opening_m, covariance, *known)
+        return cls.of(model.edges, gripper, at, opening_m, covariance, shown.offset, shown.images_covariance)
 
     @property
     def digest(self) -> str:

@@ -100,12 +100,10 @@ def swinging(swing: Array, way: Array, noise: Array) -> Array:
 class Mount:
     """The motions that one mount is expected to make."""
 
-    def __init__(self, creep: Array, jumps_per_month: float, play: Array):
-        """``creep`` (6,): variance that its slow motion grows by in a second, m² and rad²; ``play`` (6,): standard
-        deviations of what it is known to move by to and fro, m and rad, until that is learnt.
-        """
+    def __init__(self, creep: Array, jumps_per_month: float):
+        """``creep`` (6,): variance that its slow motion grows by in a second, m² and rad²."""
         self._creep, self._jumps_per_s = creep, jumps_per_month / (30.0 * 86_400.0)
-        self._swing: Array = np.square(play)
+        self._swing: Array = np.zeros(6)
         self.swing: Array = self._swing
         """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
 
