@@ -97,6 +97,18 @@ def test_light_changes_nothing(gain: float, offset_dn: float):
     assert told_m(simulation, strips, lit, 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
 
 
+def test_a_pose_at_which_nothing_of_them_shows_is_forgotten():
+    """They aren't followed from there: afterwards they are seen in their place as before."""
+    simulation, strips, image = lined()
+    truth = simulation.truth(LAST)
+    true_T, opening_m = truth.cam_T_grip, truth.jaw_opening_m
+    behind_T = true_T.copy()
+    behind_T[2, 3] = -0.2
+    assert strips.compare(image, true_T, opening_m, RISK).here
+    strips.compare(image, behind_T, opening_m, RISK)
+    assert strips.compare(image, true_T, opening_m, RISK).here
+
+
 def test_they_move_with_the_jaws():
     knots = ((0.0, 0.034), (1.5, 0.034), (4.0, 0.024))
     simulation = filmed(LINED, jaw=JawScript(knots=knots))

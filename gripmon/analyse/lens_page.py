@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,9 +100,15 @@ def _without_points(found: CameraFromViews) -> list[dict[str, object]]:
     ]  # fmt: skip
 
 
+def _names(files: Sequence[str]) -> list[str]:
+    """Of files, without their folders unless two have one name."""
+    short = [Path(file).name for file in files]
+    return [plain(short[k] if short.count(short[k]) == 1 else file) for k, file in enumerate(files)]
+
+
 def view_figure(found: CameraFromViews) -> Figure:
     """The root mean square residual of each view; a bar is red where most of its points were left out."""
-    names = [plain(Path(sighting.name).name) for sighting in found.sightings]
+    names = _names([sighting.name for sighting in found.sightings])
     figure = Figure(96 + max(22 * len(names), 60), [("", 1.0)], axis="rms residual of each image (px)")
     figure.axis(1, type="category", autorange="reversed", showgrid=False)
     colours = [BLUE if used.mean() > 0.5 else BAD for used in found.fit.used]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.records import Array
@@ -44,8 +45,13 @@ class TargetPoints:
         whole = [s for s in sightings if s.turns]
         if len(whole) < FEWEST_VIEWS:
             return None
-        known = np.unique(np.concatenate([_keys(s.plate_m) for s in whole]), axis=0)
-        return cls.numbered(sightings, np.concatenate([known * _SAME_M, np.zeros((len(known), 1))], axis=1))
+        points = np.concatenate([s.plate_m[:, :2] for s in whole])
+        _, first = np.unique(np.rint(points / _SAME_M), axis=0, return_index=True)
+        known = points[first]
+        # A place between two micrometres may have been rounded to either.
+        again = [later for _, later in cKDTree(known).query_pairs(_SAME_M)]
+        known = np.delete(known, again, axis=0)
+        return cls.numbered(sightings, np.concatenate([known, np.zeros((len(known), 1))], axis=1))
 
     @classmethod
     def numbered(cls, sightings: Sequence[Sighting], places_m: Array) -> TargetPoints:
@@ -56,8 +62,8 @@ class TargetPoints:
 
     def numbers(self, plate_m: Array) -> NDArray[np.intp]:
         """Of the points at these places (n, 3); -1 where it has none."""
-        known = {key: i for i, key in enumerate(map(tuple, _keys(self.places_m).tolist()))}
-        return np.array([known.get(tuple(key), -1) for key in _keys(plate_m).tolist()], np.intp)
+        away, number = cKDTree(self.places_m[:, :2]).query(plate_m[:, :2], distance_upper_bound=_SAME_M)
+        return np.where(np.isfinite(away), number, -1).astype(np.intp)
 
     def turned(self, turns: int, number: int) -> Array:
         """(4, 4): the ``number``-th of so many turns by which the target comes to lie on itself."""
@@ -83,10 +89,6 @@ class TargetPoints:
         """The sightings with their points where they are, given the displacement (m, 3) of each."""
         at = np.vstack([displacement_m, np.zeros(3)])
         return [replace(s, plate_m=s.plate_m + at[k]) for s, k in zip(sightings, self.index, strict=True)]
-
-
-def _keys(places_m: Array) -> NDArray[np.intp]:
-    return np.rint(places_m[:, :2] / _SAME_M).astype(np.intp)
 
 
 def off_plane_m(places_m: Array, displacement_m: Array) -> float:

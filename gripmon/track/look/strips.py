@@ -256,8 +256,11 @@ class FingerStrips:
             u, v, moved_px = _followed(kept.uv_px, kept.jacobian, kept.cam_T_grip, cam_T_grip, opened_m, share)
         # Followed so far, they are off by the second order of a rotation by as much: its square over the focal length.
         if not moved_px <= ONE_EDGE_PX:
-            kept = self._places[beyond] = self._project(layout, cam_T_grip, jaw_opening_m, beyond)
+            kept = self._project(layout, cam_T_grip, jaw_opening_m, beyond)
             u, v, _ = _followed(kept.uv_px, kept.jacobian, cam_T_grip, cam_T_grip, 0.0, share)
+            self._places.pop(beyond, None)
+            if kept.jacobian.any():  # from a pose at which nothing projects nothing can be followed
+                self._places[beyond] = kept
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         if values.ndim == 3:
             values = values @ GREY_BGR
