@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import time
-from array import array
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import contextmanager
 from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 import msgspec
@@ -50,6 +49,7 @@ from gripmon.record.read import recordings_below
 from gripmon.record.recorder import Recorder
 
 _log = logging.getLogger(__name__)
+_LATENCY_BIN = 0.02  # natural logarithm
 
 
 class RecordedInputs(NamedTuple):
@@ -120,7 +120,7 @@ def _repeated(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
 
 
 class Counts:
-    """Statistics of the frames; eight bytes of memory a frame."""
+    """Statistics of the frames, in memory that doesn't grow with them."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -129,7 +129,7 @@ class Counts:
         self._verdicts: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()  # why nothing was measured, by the text before the colon
         self._examples: dict[str, str] = {}  # the first reason of each kind, whole
-        self._latencies_ns = array("q")
+        self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
         """Count one frame."""
@@ -141,7 +141,7 @@ class Counts:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
             self._examples.setdefault(kind, record.reason)
-        self._latencies_ns.append(record.latency_ns)
+        self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
 
     def caution(self) -> list[str]:
         """A line that comes first, if too little was measured."""
@@ -153,13 +153,22 @@ class Counts:
         if not self.frames:
             return "no frames: nothing in the input can be read as an image"
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
-        text = f"{self.frames} frames: {verdicts}; median {1e-6 * median(self._latencies_ns):.2f} ms a frame"
+        text = f"{self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
         if failed := self._reasons["internal error"]:
             text += f"; {failed} failed ({self._examples['internal error']})"
         if not self.usable:
             reason = max(self._reasons, key=self._reasons.__getitem__, default="")
             text += f"; no frame could be used ({self._examples.get(reason, 'no measurement')})"
         return text
+
+    def _median_ms(self) -> float:
+        """The median latency, ms, to one per cent."""
+        below = 0
+        for index in sorted(self._latencies):
+            below += self._latencies[index]
+            if 2 * below > self.frames:
+                return 1e-6 * math.exp(index * _LATENCY_BIN)
+        return math.nan
 
 
 class FrameReplay:
