@@ -315,7 +315,8 @@ class ProfileScore:
     def _step(self, at: Projected, pull: Floats, offsets: Floats, width: float, gone: Array, sigma: Array) -> Array:
         """(h, 6)."""
         total = pull.sum(axis=2)
-        offset = (pull @ offsets) / np.maximum(total, 1e-9)
+        with np.errstate(invalid="ignore"):  # which OpenBLAS may set for finite numbers (NumPy's issue 24067)
+            offset = (pull @ offsets) / np.maximum(total, 1e-9)
         weight = total / (total + 3.0)
         per_pitch = 1.0 / self._window.pitch
         x = at.column * self._window.pitch + self._window.low_xy[0]
