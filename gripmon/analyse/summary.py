@@ -157,11 +157,10 @@ def _at_end(report: RecordingReport, motions: Sequence[Event], maybe: bool) -> s
     if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
         return f"It has moved back: {measured}, the TCP was {millimetres(off.size_m, off.sigma_m)} from where it began."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad, off.rotation_sigma_rad)}"
-    still = "still " if motions else ""
-    text = f"It is {still}displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
+    verb = "may be" if maybe else "is still" if motions else "is"
+    text = f"It {verb} displaced: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     if maybe:
         assert report.missable_m is not None
-        text = text.replace("is displaced", "may be displaced", 1)
         return f"{text}; by up to {millimetres(report.missable_m)} another background would look the same."
     now = report.at_end_against_reference
     if len(report.references) < 2 or now is None:
