@@ -27,6 +27,7 @@ from gripmon.model.provenance import provenance_of
 from gripmon.model.yaml_text import as_yaml
 from gripmon.track.edges.taught import gripper_digest
 
+Written = Callable[[dict[str, Any]], dict[str, Any]]
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"
 BROWN = BrownConradyLens(
     **{key: getattr(PAPER_LENS, key) for key in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")},
@@ -86,13 +87,15 @@ def test_files_and_sections_say_the_same(folder: Path):
     assert by_files.reference.covariance == COVARIANCE and not by_files.reference.with_gripper
 
 
-def test_a_camera_as_a_configuration_has_it_may_stand_in_a_file_of_its_own(folder: Path):
+@pytest.mark.parametrize("written", [lambda lens: lens, lambda lens: {"camera": lens}], ids=["bare", "as the section"])
+def test_a_camera_as_a_configuration_has_it_may_stand_in_a_file_of_its_own(folder: Path, written: Written):
     by_calibration = load_config(folder / "arm.yaml")
     lens = {**sections()["camera"], "model": "paper"}
-    (folder / "lens.yaml").write_text(as_yaml(lens))
+    (folder / "lens.yaml").write_text(as_yaml(written(lens)))
     change(folder / "arm.yaml", lambda v: v.update(camera="lens.yaml"))
     assert load_config(folder / "arm.yaml").settings == by_calibration.settings
-    (folder / "lens.yaml").write_text(as_yaml({**lens, "fx_px": "wide"}))
+    assert read_calibrated(folder / "lens.yaml").lens == by_calibration.settings.camera  # as an option names it
+    (folder / "lens.yaml").write_text(as_yaml(written({**lens, "fx_px": "wide"})))
     with pytest.raises(ConfigError, match=r"lens\.yaml: fx_px: "):
         load_config(folder / "arm.yaml")
 

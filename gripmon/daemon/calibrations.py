@@ -85,8 +85,8 @@ def _of_yaml(file: GivenFile, values: dict[str, object]) -> Calibrated:
         return readers[str(values["schema"])](file)
     if "camera" in values and "gripper" in values:
         return _configuration(path)
-    if "fx_px" in values:
-        return Calibrated(str(path), "a camera", read_settings(path, LensSettings, values))  # type: ignore[arg-type]
+    if file.lens is not None:
+        return Calibrated(str(path), "a camera", read_settings(path, LensSettings, file.lens))  # type: ignore[arg-type]
     kind = kind_of(values)
     if kind is None and (found := _foreign(file)) is not None:
         return found

@@ -77,8 +77,8 @@ def read_camera(file: Path | GivenFile) -> CameraCalibration:
     :class:`ConfigError`, for another program's file :class:`~gripmon.model.errors.InputError`.
     """
     file = file if isinstance(file, GivenFile) else GivenFile(file)
-    if file.is_lens:
-        lens: LensSettings = read_settings(file.path, LensSettings, file.values)  # type: ignore[arg-type]
+    if file.lens is not None:
+        lens: LensSettings = read_settings(file.path, LensSettings, file.lens)  # type: ignore[arg-type]
         made = provenance_of(f"read from {file.path.name}", [file.input])
         return CameraCalibration(camera=lens, parameters=(), covariance=(), provenance=made)
     foreign = foreign_camera(file)

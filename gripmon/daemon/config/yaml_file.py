@@ -59,9 +59,17 @@ class GivenFile:
         return self._has("schema")
 
     @property
-    def is_lens(self) -> bool:
-        """Whether it is a camera as a configuration has it in its section."""
-        return self._has("fx_px") and not self.own
+    def lens(self) -> dict[str, Any] | None:
+        """The values of a camera as a configuration has it, in its section ``camera`` or without that name; None if it
+        holds no such camera, or more than that.
+        """
+        if self.own:
+            return None
+        if self._has("fx_px"):
+            return self.values
+        section = self.values.get("camera") if self._has("camera") else None
+        alone = isinstance(section, dict) and len(self.values) == 1
+        return section if alone else None
 
     def _has(self, key: str) -> bool:
         with contextlib.suppress(InputError):
