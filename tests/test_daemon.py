@@ -12,8 +12,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 import pytest
@@ -259,21 +260,43 @@ def test_without_a_feed_the_frames_opening_stays():
     assert bench.network.transforms[0].jaw_opening_m == 0.03
 
 
-def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing(monkeypatch: pytest.MonkeyPatch):
-    reader, writer = os.pipe()
-    with os.fdopen(writer, "w") as pipe, os.fdopen(reader, "rb", buffering=0) as read:
-        monkeypatch.setattr(sys, "stderr", pipe)
+@pytest.mark.parametrize(("opened", "length"), [(os.pipe, 20), (os.pipe, 9000), (os.openpty, 20), (os.openpty, 200)])
+def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing(
+    opened: Callable[[], tuple[int, int]], length: int, monkeypatch: pytest.MonkeyPatch
+):
+    """A pipe, which takes 64 KiB, and a terminal, which takes some KiB and has room for less than a line then."""
+    reader, writer = opened()
+    os.set_blocking(reader, False)
+    filler = "." * length
+    with os.fdopen(writer, "w") as stream, os.fdopen(reader, "rb", buffering=0) as read:
+        monkeypatch.setattr(sys, "stderr", stream)
         log_to_stderr()
         log = logging.getLogger("gripmon.test")
-        for number in range(5000):  # 64 KiB are taken
-            log.info("line %d", number)
-        taken = read.read(1 << 20).decode().splitlines()
+        for number in range(5000):
+            log.info("line %d %s", number, filler)
+        taken = all_of(read)
         log.info("the last one")
-        said = read.read(1 << 20).decode().splitlines()
+        log.info("one more")
+        taken += all_of(read)
         logging.getLogger("gripmon").handlers.clear()
-    assert [line.split("line ")[1] for line in taken] == [str(k) for k in range(len(taken))] and len(taken) < 5000
-    assert said[0].endswith(f"{5000 - len(taken)} lines of this log are missing: nobody read it")
-    assert said[1].endswith("the last one")
+    lines = [line.split(" ", 3)[3] for line in taken.decode().splitlines() if line]
+    number = lost = 0
+    for line in lines[:-2]:
+        if (missing := re.fullmatch(r"(\d+) lines of this log are missing: nobody read it", line)) is not None:
+            number, lost = number + int(missing[1]), lost + int(missing[1])
+        else:
+            assert line == f"line {number} {filler}"
+            number += 1
+    assert number == 5000 and 0 < lost < 5000
+    assert lines[-2:] == ["the last one", "one more"]
+
+
+def all_of(file: BinaryIO) -> bytes:
+    """What is there to be read."""
+    data = b""
+    while part := file.read(1 << 20):
+        data += part
+    return data
 
 
 def write(estimates: EstimatesFile, seq: int) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import select
 import socket
+import stat
 import sys
 from typing import TextIO
 
@@ -46,25 +48,59 @@ class _Unhurried(logging.StreamHandler[TextIO]):
     room are counted, and how many were lost is the first line when there is.
     """
 
-    _lost = 0
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__(stream)
+        self._lost, self._rest = 0, b""
+        self._own = _opened_again(stream)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record if that doesn't wait."""
-        if not self._has_room():
-            self._lost += 1
-            return
-        if self._lost:
-            lost, self._lost = self._lost, 0
-            text = f"{lost} lines of this log are missing: nobody read it"
-            super().emit(logging.LogRecord(record.name, logging.WARNING, __file__, 0, text, (), None))
-        super().emit(record)
+        lost = f"{self._lost} lines of this log are missing: nobody read it"
+        before = logging.LogRecord(record.name, logging.WARNING, __file__, 0, lost, (), None)
+        try:
+            if self._lost and self._written(before):
+                self._lost = 0
+            if self._lost or not self._written(record):
+                self._lost += 1
+        except Exception:  # noqa: BLE001 - as every handler's: a log that fails ends nothing
+            self.handleError(record)
+
+    def _written(self, record: logging.LogRecord) -> bool:
+        """Whether there was room for its line, of which a part may wait."""
+        text = self.format(record) + self.terminator
+        if self._own is None:
+            if room := self._has_room():
+                self.stream.write(text)
+                self.flush()
+            return room
+        with contextlib.suppress(BlockingIOError):
+            self._rest = self._rest[os.write(self._own, self._rest) :] if self._rest else b""
+            if not self._rest:
+                data = text.encode(errors="backslashreplace")
+                self._rest = data[os.write(self._own, data) :]
+                return True
+        return False
 
     def _has_room(self) -> bool:
-        """Whether a line can be written without waiting, for pipes, sockets and terminals."""
+        """Whether a line can be written to a socket without waiting."""
         try:
             return bool(select.select((), (self.stream,), (), 0.0)[1])
         except (OSError, ValueError):  # not a file: there is always room
             return True
+
+
+def _opened_again(stream: TextIO) -> int | None:
+    """A descriptor of the same pipe or terminal that never waits: both say that there is room, and then wait, if a line
+    is longer than that.  The stream's own is shared with other programs, which such a flag would confuse.  None for
+    anything else.
+    """
+    try:
+        number = stream.fileno()
+        if stat.S_ISFIFO(os.fstat(number).st_mode) or os.isatty(number):
+            return os.open(f"/proc/self/fd/{number}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except (OSError, ValueError):  # no file, or a terminal of another user's
+        pass
+    return None
 
 
 class ServiceManager:
