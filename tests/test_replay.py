@@ -149,6 +149,27 @@ def test_names_are_counted_as_people_count(copied: Path, tmp_path: Path):
     assert [line["stamp_ns"] for line in lines] == [i * 250_000_000 for i in range(20)]
 
 
+def test_images_without_times_follow_each_other_at_the_rate_of_the_configuration(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Stills are no video: they count as 25 a second only if nobody says else, and that is said."""
+    (copied / "timestamps.csv").unlink()
+    for path in sorted(copied.glob("*.png"))[3:]:
+        path.unlink()
+    config = copied / "config.yaml"
+    plain = config.read_text().replace("source: frames", "source: fixed")
+    config.write_text(re.sub(r"  fps: [\d.]+", "", plain))
+    stamps_ns = [line["stamp_ns"] for line in replayed(copied, tmp_path / "usual.jsonl")]
+    assert stamps_ns == [0, 40_000_000, 80_000_000]
+    said = "has no timestamps.csv: its images count as 25 a second; --fps HZ says else"
+    assert capsys.readouterr().err.count(said) == 1
+    config.write_text(re.sub(r"fps: [\d.]+", "fps: 0.5", plain))
+    stamps_ns = [line["stamp_ns"] for line in replayed(copied, tmp_path / "slow.jsonl")]
+    assert stamps_ns == [0, 2_000_000_000, 4_000_000_000] and "25 a second" not in capsys.readouterr().err
+    replayed(copied, tmp_path / "given.jsonl", "--fps", "25")
+    assert "25 a second" not in capsys.readouterr().err
+
+
 def test_a_video_gives_what_its_frames_give(sequence: Path, tmp_path: Path):
     """Lossless, so every number is that of the images, to rounding (the jaw opening is the nominal one in both)."""
     video = tmp_path / "wrist.avi"

@@ -27,6 +27,7 @@ from gripmon.io.sources import (
     LeRobotSettings,
     Source,
     SourceError,
+    VideoSettings,
     settings_for_path,
 )
 from gripmon.io.sources import open_source as start
@@ -287,6 +288,8 @@ def _open_input(
         settings = as_configured(settings, config, camera, episode)
     elif camera is not None or episode is not None:
         raise InputError(f"--{'camera' if camera else 'episode'}: {path} has one camera and one episode; leave it out")
+    elif fps is None:
+        settings = _at_configured_rate(settings, config, warn)
     try:
         source = start(settings)
     except SourceError as error:
@@ -299,6 +302,22 @@ def _open_input(
     if config is not None and lens is not None and (off := lens_fault(lens, config.settings.camera)) is not None:
         warn(off)
     return source
+
+
+def _at_configured_rate(
+    settings: FolderSettings | VideoSettings, config: Config | None, warn: Callable[[str], None]
+) -> FolderSettings | VideoSettings:
+    """The settings with the rate of the configuration's source, if that is of the same kind; images that have neither
+    times nor a rate are told how they count: stills as a video's frames would seem to follow each other at once.
+    """
+    given = None if config is None else config.settings.source
+    if isinstance(given, FolderSettings | VideoSettings) and type(given) is type(settings):
+        settings = msgspec.structs.replace(settings, fps=given.fps)
+    usual = FolderSettings(path=settings.path)
+    if settings == usual and not (Path(settings.path) / TIMESTAMPS_NAME).exists():
+        how = f"its images count as {usual.fps:g} a second; --fps HZ says else"
+        warn(f"{settings.path}: has no {TIMESTAMPS_NAME}: {how}")
+    return settings
 
 
 def as_configured(
