@@ -24,8 +24,8 @@ from gripmon.io.sources import Waiting
 from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture
-from gripmon.teach.messages import BadRequest, Evaluation, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page_server import PageServer, Sandboxed, Served
+from gripmon.teach.messages import BadRequest, EmptyRequest, Evaluation, Saved, SaveOrder, SavingRefused
+from gripmon.teach.page_server import Action, PageServer, Sandboxed, Served
 from gripmon.teach.session import Labels, Setup, TeachSession
 from gripmon.teach.sites import OutlineSite, TeachSite
 
@@ -114,18 +114,30 @@ def test_every_file_of_the_page_is_served_and_allows_nobody_else(served: PageSer
 
 
 def test_a_page_with_scripts_of_its_own_runs_them_without_the_sites_origin():
-    """A file of a project may be anyone's: its scripts could carry out the steps of ``gripmon setup``."""
+    """A file of a project may be anyone's: its scripts could carry out the steps of ``gripmon setup``, nor does the
+    token in its address open any of them.
+    """
 
     class Pages:
         def get(self, path: str) -> Served | None:
-            return Sandboxed(b"<script>1</script>") if path == "own" else b"{}", "text/html"
+            return Sandboxed(b"<script>1</script>") if path == "own?3" else b"{}", "text/html"
 
-        def post(self, path: str) -> None:
-            return None
+        def post(self, path: str) -> Action | None:
+            return EmptyRequest, lambda _: {}
 
     server = PageServer(Pages())
     try:
-        own, plain = (ask(server, path)[1] for path in ("own", "other"))
+        plain = ask(server, "other")[1]
+        status, moved, _ = ask(server, "own?3")
+        assert status == 303 and moved["Location"].endswith("/own?3")
+        token = urllib.parse.urlsplit(server.url).path
+        theirs = moved["Location"].removesuffix("own?3")
+        assert theirs != token
+        status, own, data = ask(server, path=moved["Location"])
+        assert status == 200 and data == b"<script>1</script>"
+        for path, method in (("other", "GET"), ("other", "POST"), ("done", "POST")):
+            assert ask(server, path=theirs + path, method=method, body=b"{}")[0] == 404
+        assert ask(server, "other", "POST", b"{}")[0] == 200 and not server.done.is_set()
     finally:
         server.close()
     assert own["Content-Security-Policy"].startswith("sandbox allow-scripts; default-src 'none'; script-src 'unsafe-in")

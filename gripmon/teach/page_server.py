@@ -67,7 +67,9 @@ _ALONE = {
 
 
 class Sandboxed(bytes):
-    """A page with scripts of its own, from a file: it runs them without this site's origin."""
+    """A page with scripts of its own, from a file: it runs them without this site's origin, and the token in its
+    address opens such pages alone.
+    """
 
 
 Served = tuple[bytes, str]
@@ -160,7 +162,7 @@ class _Http(ThreadingHTTPServer):
 
     def __init__(self, site: Site, port: int, address: str):
         self.site, self.done = site, threading.Event()
-        self.token = secrets.token_urlsafe(_TOKEN_BYTES)
+        self.token, self.sandbox_token = (secrets.token_urlsafe(_TOKEN_BYTES) for _ in range(2))
         self.encode = msgspec.json.Encoder(enc_hook=_as_list).encode
         super().__init__((address, port), _Handler)
         names = {address, "localhost"} if address == ADDRESS else {address}
@@ -178,9 +180,11 @@ class _Http(ThreadingHTTPServer):
 
 
 class _Refused(Exception):
-    def __init__(self, status: HTTPStatus, text: str):
+    """``location``: where it is instead."""
+
+    def __init__(self, status: HTTPStatus, text: str, location: str = ""):
         super().__init__(text)
-        self.status = status
+        self.status, self.location = status, location
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -189,6 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _SILENT_S
     server: _Http
     _last = False
+    _location = ""
 
     def do_GET(self) -> None:
         self._answer(self._get)
@@ -198,11 +203,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, act: Callable[[str], Served]) -> None:
         """Answer every request, errors with one line."""
-        status, kind = HTTPStatus.OK, "application/json"
+        status, kind, self._location = HTTPStatus.OK, "application/json", ""
         try:
             data, kind = act(self._checked_path())
         except _Refused as refused:
-            status, data = refused.status, self._failure(str(refused))
+            status, data, self._location = refused.status, self._failure(str(refused)), refused.location
         except (BadRequest, InputError) as refused:
             status, data = HTTPStatus.BAD_REQUEST, self._failure(str(refused))
         except (ConnectionError, TimeoutError):
@@ -222,6 +227,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         for name, value in (_HEADERS | (_ALONE if isinstance(data, Sandboxed) else {})).items():
             self.send_header(name, value)
+        if self._location:
+            self.send_header("Location", self._location)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
         if self.close_connection:
@@ -243,19 +250,24 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.FORBIDDEN, "requested by another site")
         _, _, path = self.path.partition("/")
         token, slash, rest = path.partition("/")
-        if not slash or not secrets.compare_digest(token.encode(), server.token.encode()):
+        is_site, self._is_sandbox = (
+            secrets.compare_digest(token.encode(), known.encode()) for known in (server.token, server.sandbox_token)
+        )
+        if not slash or not (is_site or self._is_sandbox):
             raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon printed")
         return rest
 
     def _get(self, path: str) -> Served:
         found = self.server.site.get(path)
-        if found is None:
+        if found is None or (self._is_sandbox and not isinstance(found[0], Sandboxed)):
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+        if isinstance(found[0], Sandboxed) and not self._is_sandbox:
+            raise _Refused(HTTPStatus.SEE_OTHER, "it has an address of its own", f"/{self.server.sandbox_token}/{path}")
         return found
 
     def _post(self, path: str) -> Served:
         action = (EmptyRequest, self._end) if path == "done" else self.server.site.post(path)
-        if action is None:
+        if action is None or self._is_sandbox:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
         kind, act = action
         return self.server.encode(act(self._body(kind))), "application/json"
