@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import subprocess
 import sys
@@ -385,6 +386,19 @@ def test_a_video_that_opencv_can_not_decode_is_read_by_pyav(tmp_path: Path, monk
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(SourceError, match=r"OpenCV can't decode this 'AV01', PyAV may \(.* package av; pip install"):
         open_source(VideoSettings(path="a.mp4"), tmp_path)
+
+
+def test_a_video_that_is_damaged_on_the_way_says_why_it_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    times_s = np.arange(60) / 25.0
+    noise = np.random.default_rng(1).integers(0, 255, (60, 48, 64), np.uint8)
+    write_video_at(tmp_path / "a.mp4", list(noise), times_s, "libsvtav1")
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    damaged = slice(3 * len(data) // 10, 3 * len(data) // 10 + 20_000)
+    data[damaged] = np.random.default_rng(2).bytes(20_000)
+    (tmp_path / "a.mp4").write_bytes(data)
+    frames = read_all(open_source(VideoSettings(path="a.mp4"), tmp_path))
+    assert 0 < len(frames) < 60
+    assert re.search(r"the video ends after [\d.]+ s: .*a\.mp4 can't be decoded \(.+\); is it truncated\?", caplog.text)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no video at all" * 100])

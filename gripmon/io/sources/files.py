@@ -231,8 +231,10 @@ class VideoSource(Stored):
         if not self._open:
             return None
         if not (self._is_there or self._capture.grab()):
-            if self._due_s > 1e-9 * (self._last_ns + self._longest_ns):
-                end_s = 1e-9 * self._last_ns
+            end_s = 1e-9 * self._last_ns
+            if fault := getattr(self._capture, "fault", ""):  # OpenCV names none
+                _log.warning("the video ends after %.3g s: %s", end_s, fault)
+            elif self._due_s > end_s + 1e-9 * self._longest_ns:
                 _log.warning("%s ends after %.3g s of %.3g s; is it truncated?", self._path, end_s, self._due_s)
             self._end()
             return None
@@ -295,15 +297,20 @@ def _opened_video(path: Path) -> tuple[_Capture, float]:
     capture.release()
     try:
         other = _ByPyAv(path)
-        if other.grab():
-            return other, due_s
     except SourceError as error:
         raise SourceError(f"path: {path}: OpenCV can't decode this {codec!r}, PyAV may ({error})") from None
-    raise SourceError(f"path: {path} has no frame that can be decoded ({codec!r}); a complete video")
+    if other.grab():
+        return other, due_s
+    why = other.fault or repr(codec)
+    raise SourceError(f"path: {path} has no frame that can be decoded ({why}); a complete video")
 
 
 class _ByPyAv:
-    """A video by PyAV; its frames are as it has them, whatever it says of the way up."""
+    """A video by PyAV; its frames are as it has them, whatever it says of the way up.  ``fault``: why it ended before
+    the end, empty if it didn't.
+    """
+
+    fault = ""
 
     def __init__(self, path: Path) -> None:
         needed("av")
@@ -314,8 +321,8 @@ class _ByPyAv:
     def grab(self) -> bool:
         try:
             self._frame = next(self._frames, None)
-        except SourceError:
-            self._frame = None
+        except SourceError as error:
+            self._frame, self.fault = None, str(error)
         if self._frame is not None and math.isnan(self._first_s):
             self._first_s = self._frame[0]
         return self._frame is not None
