@@ -50,6 +50,15 @@ def test_each_point_stands_where_it_is_with_its_residual(found: CameraFromViews)
     assert made["layout"]["yaxis"]["range"] == [575.5, -0.5] and made["layout"]["xaxis"]["range"] == [-0.5, 767.5]
 
 
+def test_images_of_one_name_are_told_apart_at_each_point(found: CameraFromViews):
+    names = ["left/0.png", "right/0.png", "right/1.png", *(view.name for view in found.sightings[3:])]
+    views = [replace(view, name=name) for view, name in zip(found.sightings, names, strict=True)]
+    page = lens_page(replace(found, fit=replace(found.fit, sightings=tuple(views))), "camera.yaml")
+    made = figures(page)["residuals"]
+    words = [text.rpartition(": ")[0] for trace in made["data"] for text in trace.get("text", ())]
+    assert list(dict.fromkeys(words))[:3] == ["left/0.png", "right/0.png", "1.png"]
+
+
 def test_parts_of_the_image_without_points_are_tinted(found: CameraFromViews):
     tinted = figures(lens_page(found, "camera.yaml"))["residuals"]["layout"]["shapes"]
     uv_px = np.concatenate([s.uv_px for s in found.sightings])

@@ -50,19 +50,20 @@ def residual_figure(found: CameraFromViews) -> Figure:
     figure.axis(1, range=[camera.height_px - 0.5, -0.5], constrain="domain")
     figure.layout["xaxis"] |= {"range": [-0.5, camera.width_px - 0.5], "scaleanchor": "y", "constrain": "domain"}
     figure.layout["shapes"] = _without_points(found)
-    for name, colour, good in (("residuals", BLUE, True), ("left out", BAD, False)):
+    names = _names([sighting.name for sighting in found.sightings])
+    for what, colour, good in (("residuals", BLUE, True), ("left out", BAD, False)):
         starts, ends, words = [], [], []
-        for sighting, residual, used in zip(found.sightings, fit.residuals_px, fit.used, strict=True):
+        for name, sighting, residual, used in zip(names, found.sightings, fit.residuals_px, fit.used, strict=True):
             some = used == good
             starts.append(sighting.uv_px[some])
             ends.append(starts[-1] + _arrows(residual[some], enlarged, 2.0 * _ARROW * camera.width_px))
             sizes = np.linalg.norm(residual[some], axis=1).tolist()
-            words += [f"{plain(Path(sighting.name).name)}: {size:.3f} px" for size in sizes]
+            words += [f"{name}: {size:.3f} px" for size in sizes]
         at, to = np.concatenate(starts), np.concatenate(ends)
         if not len(at):
             continue
         lines = np.stack([at, to, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
-        named, group = f"{name}, {enlarged:{'.0f' if enlarged >= 100.0 else '.2g'}} times", {"legendgroup": name}
+        named, group = f"{what}, {enlarged:{'.0f' if enlarged >= 100.0 else '.2g'}} times", {"legendgroup": what}
         figure.add(1, lines[:, 0], lines[:, 1], named, line={"color": colour, "width": 1.2}, hoverinfo="skip", **group)
         figure.add(
             1, at[:, 0], at[:, 1], named, mode="markers", marker={"color": colour, "size": 4}, text=words,
