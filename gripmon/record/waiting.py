@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Callable
 
 from gripmon.model.outputs import Notes, Trace
-from gripmon.model.records import Frame, FrameRecord, Image, State, Verdict
-from gripmon.record.recorder import Picture, RecordingSettings, Row, pack_trace
+from gripmon.model.records import Frame, FrameRecord, Image, MeasurementTrace, State, Verdict
+from gripmon.record.recorder import Picture, RecordingSettings, Row
 
-Waiting = tuple[Row, Image | None]
-"""A frame and its image, None if that isn't kept."""
+Waiting = tuple[Row, Image | None, MeasurementTrace | None]
+"""A frame, its image and its trace, None if they aren't kept: whoever takes them has the time to pack them."""
 Beside = Callable[[Frame], tuple[FrameRecord, Picture | None]]
 """Of a frame that is replayed: its record of then, and its image as it was recorded."""
 
@@ -68,11 +68,11 @@ class WaitingFrames:
         measured, noted = trace() if kept and due else None, None if notes is None else notes()
         then, picture = (None, None) if self._beside is None else self._beside(frame)
         row = Row(
-            record, picture if kept else None, None if measured is None else pack_trace(measured),
+            record, picture if kept else None,
             jaw_reported_m=frame.jaw_opening_m, statistic_share=None if noted is None else noted.statistic_share,
             limits=None if noted is None else noted.limits, due=due, lost=lost, then=then,
         )  # fmt: skip
-        self._frames.append((row, frame.image if kept else None))
+        self._frames.append((row, frame.image if kept else None, measured))
 
     @property
     def oldest(self) -> Waiting | None:
@@ -85,18 +85,18 @@ class WaitingFrames:
     def take(self) -> Waiting | None:
         """The oldest, which leaves; None if there is none."""
         try:
-            row, image = self._frames.popleft()
+            waiting = self._frames.popleft()
         except IndexError:
             return None
-        self._images_out += image is not None
-        return row, image
+        self._images_out += waiting[1] is not None
+        return waiting
 
     def clear(self) -> None:
         self._frames.clear()
 
     def _drop_oldest(self) -> None:
         try:
-            row, image = self._frames.popleft()
+            row, image, _ = self._frames.popleft()
         except IndexError:  # the other thread took it meanwhile
             return
         self.dropped += 1

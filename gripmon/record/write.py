@@ -36,6 +36,7 @@ from gripmon.record.recorder import (
     Status,
     Then,
     ViewSettings,
+    pack_trace,
     those,
 )
 from gripmon.record.waiting import Beside, Waiting, WaitingFrames
@@ -273,15 +274,16 @@ class ProcessRecorder(Recorder):
         frames: list[msgspec.Raw] = []
         room = min(_BATCH_FRAMES, self._scene.settings.queue_frames - worker.frames_unwritten)
         while len(frames) < room and (waiting := self._next_waiting(worker)) is not None:
-            row, image = waiting
+            row, image, trace = waiting
             place, lost = None, row.lost
             if row.picture is None and image is not None and self._images.takes(image):  # else its record says why
                 place = self._share(worker, image, row.due)
                 lost = place is None
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(row.record.seq)
-            whole = msgspec.structs.replace(row, image=place, lost=lost, truth_tcp_m=truth_tcp_m)
+            packed = None if trace is None else pack_trace(trace)
+            whole = msgspec.structs.replace(row, image=place, lost=lost, truth_tcp_m=truth_tcp_m, trace=packed)
             frames.append(msgspec.Raw(self._encode(whole)))
-            if row.trace is not None or len(frames) % _FRAMES_A_TURN == 0:
+            if trace is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # releases the interpreter lock: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
         return frames
@@ -290,7 +292,7 @@ class ProcessRecorder(Recorder):
         """The next frame; None while there is none, or a source that can wait does so for a slot for its image."""
         oldest = self._frames.oldest
         if oldest is not None and self._patience_s > 0.0:
-            row, image = oldest
+            row, image, _ = oldest
             if row.picture is None and image is not None and not self._slot_free(worker, row.due):
                 return None
         return self._frames.take()
