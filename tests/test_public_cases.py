@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow.dataset as ds
 import pytest
 
 from gripmon.cli import main
@@ -118,3 +120,61 @@ def test_17_a_board_of_another_dictionary(tmp_path: Path, capsys: pytest.Capture
     assert f"markers of DICT_4X4_50 are in the images, not of DICT_5X5_50; {right}" in capsys.readouterr().err
     assert main(["calibrate", "intrinsics", folder, "--target", right, "--out", str(out)]) == 0
     assert camera_in(out).lens.fx_px == pytest.approx(900.0, abs=0.5)
+
+
+TRUE_M = [0.0004, 0.0014, 0.1188]
+"""Where the TCP is in all recordings of cases 1 to 5."""
+
+
+def in_own_folder(number: int, to: Path) -> list[str]:
+    """A recording and its configuration as a command's arguments, its results in a folder of the test's own."""
+    folder = case(number)
+    return [str(folder / "bag"), "--config", str(folder / "config.yaml"), "--out", str(to)]
+
+
+def replayed(number: int, tmp_path: Path) -> list[dict]:
+    """The records of a replay."""
+    assert main(["replay", *in_own_folder(number, tmp_path / "replay.jsonl")]) == 0
+    return [json.loads(line) for line in (tmp_path / "replay.jsonl").read_text().splitlines()]
+
+
+def extrinsics(number: int, to: Path, *options: str) -> dict:
+    """The one row of a dataset of one recording."""
+    assert main(["dataset", *in_own_folder(number, to), "--workers", "1", *options]) in (0, 3)
+    (row,) = ds.dataset(to / "stretches", partitioning="hive").to_table().to_pylist()
+    return row
+
+
+def is_right(row: dict) -> bool:
+    """Whether a valid row is where the gripper is, and within its bound."""
+    away_m = np.linalg.norm([row[f"cam_T_grip_t{axis}_m"] - true for axis, true in zip("xyz", TRUE_M, strict=True)])
+    return row["verdict"] == "valid" and away_m < 5e-5 < row["protection_m"]
+
+
+def test_1_a_region_of_interest_is_never_a_lens_that_is_off(tmp_path: Path):
+    row = extrinsics(1, tmp_path / "theirs")
+    assert row["verdict"] == "unknown" and row["cam_T_grip_tx_m"] is None
+    assert "camera_info: roi: 768 x 576 px at 8, 6 isn't part of the 768 x 576 px that K is of" in row["reason"]
+    own = extrinsics(1, tmp_path / "own", "--own-lens")
+    assert is_right(own) and own["lens"] == "configuration"
+
+
+def test_2_eight_coefficients_of_plumb_bob(tmp_path: Path):
+    row = extrinsics(2, tmp_path / "theirs")
+    assert is_right(row) and row["lens"] == "file"
+    assert is_right(extrinsics(2, tmp_path / "own", "--own-lens"))
+
+
+def test_3_one_stamp_of_the_future_costs_one_frame(tmp_path: Path):
+    records = replayed(3, tmp_path)
+    assert [record["verdict"] for record in records] == ["suspect", *["valid"] * 4, "suspect", *["valid"] * 10]
+    assert records[5]["reason"].endswith("its time stamp is wrong: 86400 s later than the log's times say")
+
+
+@pytest.mark.parametrize("number", [4, 5])
+def test_4_and_5_pixels_are_as_the_sensor_has_them(number: int, tmp_path: Path):
+    """JPEG with EXIF's orientation; 16 bits in the other byte order."""
+    records = replayed(number, tmp_path)
+    assert [record["verdict"] for record in records] == ["suspect", *["valid"] * (len(records) - 1)]
+    places_m = [record["cam_T_grip"]["translation_m"] for record in records]
+    np.testing.assert_allclose(places_m, [TRUE_M] * len(records), atol=5e-5)
