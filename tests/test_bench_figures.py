@@ -6,7 +6,6 @@ import re
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
@@ -83,27 +82,6 @@ def test_the_report_counts_by_hand():
     assert "wrong: 1 of 6 trials, at most 58.18 %" in text
     fine = as_text(machine, 7, outcomes[:2])
     assert "   met" in fine and "NOT MET" not in fine
-
-
-def test_statistics_of_autoregressions_and_levels_are_what_their_equations_say():
-    from benchmarks.noise_statistics import LAGS, statistics
-
-    rng = np.random.default_rng(1)
-    factor, level_sd = 0.9, 2.0
-    noise = lfilter([np.sqrt(1.0 - factor**2)], [1.0, -factor], rng.normal(size=(400, 1700, 6)), axis=1)[:, 100:]
-    found = statistics(noise + level_sd * rng.normal(size=(400, 1, 6)))
-    lags = LAGS[: len(found.structure)]
-    np.testing.assert_allclose(found.structure.mean(axis=1), 1.0 - factor**lags, rtol=0.02)
-    for k, n in enumerate(found.windows):
-        # The covariance of all pairs of a window, summed one by one.
-        apart = np.abs(np.subtract.outer(np.arange(2 * n), np.arange(2 * n)))
-        pairs = factor**apart
-        mean = pairs[:n, :n].mean()
-        assert found.mean_variance[k].mean() == pytest.approx(mean + level_sd**2, rel=0.05)
-        if k < len(found.step_variance):
-            assert found.step_variance[k].mean() == pytest.approx(mean - pairs[:n, n:].mean(), rel=0.05)
-            assert found.kurtosis[k] == pytest.approx(3.0, abs=0.3)
-    np.testing.assert_allclose(found.tails[0], [1.645, 2.576, 3.291], rtol=0.02)
 
 
 def test_the_summary_of_laser_trials_is_honest_about_failures_and_bounds():

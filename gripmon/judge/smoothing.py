@@ -45,7 +45,7 @@ FOLLOW_MEMORY, LAG_SCATTER_RATIO = 0.25, 2.5
 usual scatter above which the average lags: the transform then follows the frames, and the average catches up."""
 SETTLING_LAG = 0.7
 """While the average settles, the transform follows the frames from this part of the limit: averaging gains little.
-Without it errors right after a knock are 1 to 4 % larger (tools/bench smoothing)."""
+Without it errors right after a knock are 1 to 4 % larger (docs/results/drift.md)."""
 LAG_VARIANCE_FACTOR = 0.5
 """Variance that a lag adds to the average's, over the square of the lag."""
 

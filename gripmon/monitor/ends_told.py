@@ -20,7 +20,7 @@ from gripmon.track.edges import FingerEndsSeen, Measurement
 
 RIGHT, WRONG = np.array([0.155, 0.276, 0.569]), np.array([0.812, 0.117, 0.071])
 """How probable 0, 1 or 2 indications of a finger's end are where it is one and where it is something else, of one of
-several fingers in view.  These tables: 1,518 right fits and 524 that had slid (``tools/bench belief --witnesses``).
+several fingers in view.  These tables: 1,518 right fits and 524 that had slid, on scenes of ``tools/bench integrity``.
 """
 LONE_RIGHT, LONE_WRONG = np.array([0.049, 0.121, 0.830]), np.array([0.687, 0.139, 0.174])
 """The same of the only finger in view."""

@@ -13,7 +13,6 @@ from benchmarks import (
     correction,
     dataset,
     drift,
-    frames_in,
     integrity,
     laser,
     latency,
@@ -24,7 +23,6 @@ from benchmarks import (
     recovery,
     series,
     shapes,
-    smoothing,
     wire,
 )
 
@@ -35,7 +33,6 @@ _BENCHMARKS = (
     correction,
     dataset,
     drift,
-    frames_in,
     integrity,
     laser,
     latency,
@@ -46,7 +43,6 @@ _BENCHMARKS = (
     recovery,
     series,
     shapes,
-    smoothing,
     wire,
 )
 

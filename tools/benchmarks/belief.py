@@ -163,11 +163,6 @@ def handle(arguments: argparse.Namespace) -> int:
     setup = Setup(most=arguments.most, searching=not arguments.search_off)
     print(f"seed {arguments.seed}, {FRAMES} frames a run, at most {arguments.most} hypotheses\n")
     worlds = {"own": (), "second": SECOND, **{name: (name,) for name in SECOND}}
-    if arguments.witnesses:
-        from benchmarks.belief_witnesses import measured, table
-
-        print(table(measured(arguments.seed, 96)))
-        return 0
     if arguments.sensitivity:
         print(HEAD)
         for name in VARIED:
@@ -198,5 +193,4 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--sample", action="store_true", help="the risk of a world, by strata")
     what.add_argument("--sensitivity", action="store_true", help="priors times 3 and by 3, in the belief alone")
-    what.add_argument("--witnesses", action="store_true", help="what fingers' ends answer at right and at wrong places")
     parser.set_defaults(handler=handle)

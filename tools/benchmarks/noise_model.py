@@ -5,7 +5,8 @@ of a background that stands still, drawn again when the robot moves on to the ne
 first-order vector autoregression with its own correlation time, times the size that the errors had in one of the
 measured scenes.  Their innovations are Student's, times a strength that comes in bursts.  The reported covariance is
 that of the same measured scene, times a scale that wanders; a vibration of the mount is added as what it is, a motion.
-:mod:`benchmarks.noise_fit` fits all numbers; they are kept in ``data/`` beside this file.
+All numbers were fitted to the monitor's errors on simulated images and are kept in ``data/`` beside this file; commit
+a6567942 has the programs, ``noise_measured`` and ``noise_fit``.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ class NoiseModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     what the measured scenes differ by, ``burst_log_sd`` within one with the correlation time ``burst_frames``.  A scene
     lasts ``scene_frames`` on average, and the change to the next one ``move_frames``.  Logarithm of the covariance's
     scale: standard deviation ``scale_log_sd``, of which the share ``scale_white`` is new in each frame and the rest has
-    the correlation time ``scale_frames``.  ``measured``: a :class:`benchmarks.noise_statistics.Statistics` of what it
-    was fitted to.
+    the correlation time ``scale_frames``.  ``measured``: statistics of what it was fitted to, in the same units:
+    half the mean squared difference of frames by lag, variances of windows' means and steps, their kurtosis and tails.
     """
 
     regime: str
