@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import dblquad, quad
-from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 from support.shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, beside, ill_seen, knocked, two_fingers
@@ -16,7 +15,6 @@ from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, STUDENT_FREEDOM, Errors, Model, something_else, weigh
-from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
@@ -73,18 +71,6 @@ def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
     assert explanation.text == "every finger and the camera stand where they did"
 
 
-@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (6.0, -4.0, 8.0)])
-def test_pieces_lie_where_a_frame_shows_them_whatever_its_pose(turn_deg: tuple[float, ...]):
-    shown = Shown(sharp_gripper())
-    evidence = shown.evidence()
-    pooled = pool(
-        [dataclasses.replace(evidence, cam_T_grip=knocked(shown.reference, (0.02, 0.0, 0.0), turn_deg))],
-        shown.camera,
-        shown.gripper,
-    )
-    np.testing.assert_allclose(pooled.evidence.xy, evidence.xy, atol=1e-9)
-
-
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
 def test_residuals_are_distances_in_the_image_and_their_derivatives_hold(lens: LensSettings):
     """Against the camera's projection of the moved gripper, and central differences."""
@@ -139,31 +125,6 @@ def test_the_evidence_is_the_integral_over_the_prior():
     assert found.log_evidence == pytest.approx(math.log(integral), abs=0.25)
     assert found.motion[JAW] == pytest.approx(8e-5, abs=3e-5)
     assert not found.motion[POSE].any() and found.motion[FOCAL] == 0.0
-
-
-def test_the_state_that_fits_best_is_the_posteriors_mode():
-    """The opening, and an offset of each edge, all with heavy tails: a general optimiser finds the same."""
-    shown = Shown(sharp_gripper(), seed=5)
-    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
-    view = EdgeView(shown.camera, shown.gripper, evidence)
-    start = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6)))
-    held, freed = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12)
-    freed[JAW] = 1.0
-    edge = np.unique(evidence.edge, return_inverse=True)[1]
-    count, edges = len(edge), int(edge.max()) + 1
-    bias_px = np.where(edge % 3 == 0, 0.4, 0.0)
-    errors = Errors(bias_px, np.full(count, 0.2), np.full(count, 0.15), edge)
-    found = weigh(view, shown.gripper, Model(held, freed, np.array([1e-3])), start, start, errors)
-    residual, jacobian = view.residual(start)
-
-    def unlikely(unknowns: np.ndarray) -> float:
-        way_m, off_px = 1e-4 * unknowns[0], unknowns[1:]
-        error = (residual - bias_px - jacobian[:, JAW] * way_m - off_px[edge]) / 0.2
-        tails = np.log1p(error**2 / STUDENT_FREEDOM).sum() + np.log1p((off_px / 0.15) ** 2 / STUDENT_FREEDOM).sum()
-        return float(0.5 * (STUDENT_FREEDOM + 1.0) * tails + 0.5 * (way_m / 1e-3) ** 2)
-
-    best = minimize(unlikely, np.zeros(1 + edges), method="BFGS", options={"gtol": 1e-7})
-    assert found.motion[JAW] == pytest.approx(1e-4 * best.x[0], abs=3e-7)
 
 
 @pytest.mark.parametrize("off_px", [2.0, -4.0])
