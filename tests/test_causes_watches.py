@@ -45,6 +45,20 @@ def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_a
     assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]
 
 
+def test_jaws_seen_elsewhere_than_usually_are_worth_asking_about():
+    rng = np.random.default_rng(6)
+    watch = JawWatch()
+
+    def reported_m() -> float:
+        return OPENING_M + rng.normal(0.0, 3e-5)
+
+    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(500))  # an offset that was always there
+    assert not any(watch.add(OPENING_M - 1e-3, OPENING_M + 2e-4) for _ in range(2))  # two frames decide nothing
+    assert not any(watch.add(None, OPENING_M) for _ in range(20))
+    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(5))
+    assert [watch.add(reported_m() - 3e-4, OPENING_M + 2e-4) for _ in range(5)] == [False, False, True, True, True]
+
+
 @pytest.mark.parametrize(
     ("scatter_m", "off_m", "asks"),
     [
