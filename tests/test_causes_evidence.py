@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import dblquad, quad
+from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 from support.shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, beside, ill_seen, knocked, two_fingers
@@ -125,6 +126,31 @@ def test_the_evidence_is_the_integral_over_the_prior():
     assert found.log_evidence == pytest.approx(math.log(integral), abs=0.25)
     assert found.motion[JAW] == pytest.approx(8e-5, abs=3e-5)
     assert not found.motion[POSE].any() and found.motion[FOCAL] == 0.0
+
+
+def test_the_state_that_fits_best_is_the_posteriors_mode():
+    """The opening, and an offset of each edge, all with heavy tails: a general optimiser finds the same."""
+    shown = Shown(sharp_gripper(), seed=5)
+    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
+    view = EdgeView(shown.camera, shown.gripper, evidence)
+    start = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6)))
+    held, freed = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12)
+    freed[JAW] = 1.0
+    edge = np.unique(evidence.edge, return_inverse=True)[1]
+    count, edges = len(edge), int(edge.max()) + 1
+    bias_px = np.where(edge % 3 == 0, 0.4, 0.0)
+    errors = Errors(bias_px, np.full(count, 0.2), np.full(count, 0.15), edge)
+    found = weigh(view, shown.gripper, Model(held, freed, np.array([1e-3])), start, start, errors)
+    residual, jacobian = view.residual(start)
+
+    def unlikely(unknowns: np.ndarray) -> float:
+        way_m, off_px = 1e-4 * unknowns[0], unknowns[1:]
+        error = (residual - bias_px - jacobian[:, JAW] * way_m - off_px[edge]) / 0.2
+        tails = np.log1p(error**2 / STUDENT_FREEDOM).sum() + np.log1p((off_px / 0.15) ** 2 / STUDENT_FREEDOM).sum()
+        return float(0.5 * (STUDENT_FREEDOM + 1.0) * tails + 0.5 * (way_m / 1e-3) ** 2)
+
+    best = minimize(unlikely, np.zeros(1 + edges), method="BFGS", options={"gtol": 1e-7})
+    assert found.motion[JAW] == pytest.approx(1e-4 * best.x[0], abs=3e-7)
 
 
 @pytest.mark.parametrize("off_px", [2.0, -4.0])
