@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from gripmon.judge.policy import AlertBook
-from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, OpenAlert, Severity
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, Severity
 
 UPDATE_S, CLEAR_S = 2.0, 1.0
 TOPICS = ("motion", "view", "stream:clock")
@@ -41,17 +40,6 @@ class Told:
         return self.book.absent(topic, "over", self.now_s, at_once=at_once)
 
 
-def test_raised_once_however_long_it_lasts():
-    told = Told()
-    [raised] = told.present(alert())
-    assert (raised.event, raised.since_ns) == (AlertEvent.RAISED, round(1e8))
-    assert raised.alert_id
-    for _ in range(100):
-        assert told.present(alert()) == ()
-        assert told.present(msgspec.structs.replace(alert(), text="other figures")) == ()
-    assert told.book.open == (OpenAlert("motion", raised),)
-
-
 def test_cleared_when_absent_for_long_enough_without_a_break():
     told = Told()
     [raised] = told.present(alert(Severity.ERROR))
@@ -65,13 +53,6 @@ def test_cleared_when_absent_for_long_enough_without_a_break():
     [again] = told.present(alert())
     assert again.event is AlertEvent.RAISED
     assert again.alert_id != raised.alert_id
-
-
-def test_cleared_at_once_where_it_is_known_to_be_over():
-    told = Told()
-    told.present(alert())
-    assert [a.event for a in told.absent(0.0, at_once=True)] == [AlertEvent.CLEARED]
-    assert told.book.about("motion") is None
 
 
 @pytest.mark.parametrize(
@@ -117,16 +98,6 @@ def test_worse_and_a_cause_found_are_said_at_once():
     assert [a.cause for a in told.present(alert(Severity.ERROR, Cause.FINGER_BENT), UPDATE_S)] == [Cause.FINGER_BENT]
 
 
-def test_topics_live_beside_one_another():
-    told = Told()
-    [one] = told.present(alert(), topic="motion")
-    [other] = told.present(alert(), topic="view")
-    assert one.alert_id != other.alert_id
-    assert [each.topic for each in told.book.open] == ["motion", "view"], "the oldest first"
-    told.absent(0.0, "motion", at_once=True)
-    assert [each.topic for each in told.book.open] == ["view"]
-
-
 def test_acknowledged_by_id_or_all():
     told = Told()
     [one] = told.present(alert(), topic="motion")
@@ -147,18 +118,6 @@ def test_what_is_acknowledged_while_it_is_over_is_cleared_no_later():
     assert told.absent() == ()
     assert len(told.book.acknowledge()) == 1
     assert [a.event for a in told.absent(CLEAR_S)] == [AlertEvent.CLEARED]
-
-
-def test_after_a_restart_ids_go_on():
-    told = Told()
-    ids = {told.present(alert(), topic=topic)[0].alert_id for topic in TOPICS}
-    after = AlertBook(UPDATE_S, CLEAR_S)
-    after.restore(told.book.open, told.book.raised, 0.0)
-    assert after.open == told.book.open
-    assert after.present("motion", alert(), 0.1, 1) == ()
-    [new] = after.present("image", alert(), 0.1, 10**8)
-    assert new.alert_id not in ids
-    assert after.raised == 4
 
 
 def test_ids_differ_though_the_numbering_was_lost():

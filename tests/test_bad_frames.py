@@ -43,7 +43,7 @@ def _some_nan(frame: Frame) -> np.ndarray:
     return image
 
 
-BAD: dict[str, tuple[Callable[[Frame], Frame], str]] = {
+BAD: dict[str, tuple[Callable[[Frame], Frame], str]] = {  # one of a kind; every kind in words: test_inspection.py
     "nothing, as the source could not read it": (
         lambda f: replaced(f, image=None, fault="truncated: 1200 of 442386 bytes"),
         "not_an_image: truncated: 1200 of 442386 bytes",
@@ -52,27 +52,14 @@ BAD: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: replaced(f, image=None, fault="64x48 pixels", refusal=Refusal.WRONG_SIZE),
         "wrong_size: 64x48 pixels",
     ),
-    "nothing": (lambda f: replaced(f, image=None), "not_an_image"),
     "a list": (lambda f: replaced(f, image=[[0, 1], [2, 3]]), "not_an_image"),
     "half the size": (lambda f: replaced(f, image=f.image[::2, ::2]), "wrong_size: 384x288"),
-    "one row less": (lambda f: replaced(f, image=f.image[:-1]), "wrong_size: 768x575"),
-    "on its side": (lambda f: replaced(f, image=f.image.T), "wrong_size: 576x768"),
-    "no pixels": (lambda f: replaced(f, image=f.image[:0, :0]), "wrong_size: 0x0"),
     "black": (lambda f: replaced(f, image=np.zeros_like(f.image)), "black"),
-    "white": (lambda f: replaced(f, image=np.full_like(f.image, 255)), "white"),
-    "grey": (lambda f: replaced(f, image=np.full_like(f.image, 90)), "flat"),
-    "NaN": (lambda f: replaced(f, image=np.full((HEIGHT, WIDTH), np.nan, np.float32)), "not_finite"),
     "some NaN": (lambda f: replaced(f, image=_some_nan(f)), "not_finite"),
-    "infinite": (lambda f: replaced(f, image=np.full((HEIGHT, WIDTH), np.inf, np.float32)), "not_finite"),
     "double precision": (lambda f: replaced(f, image=f.image / 255.0), "wrong_type: pixels of type float64"),
-    "signed": (lambda f: replaced(f, image=f.image.astype(np.int32)), "wrong_type: pixels of type int32"),
-    "bits": (lambda f: replaced(f, image=f.image > 128), "wrong_type: pixels of type bool"),
     "words": (lambda f: replaced(f, image=f.image.astype("U3")), "wrong_type"),
     "floats up to 255": (lambda f: replaced(f, image=f.image.astype(np.float32)), "wrong_type: float pixels"),
-    "four channels": (lambda f: replaced(f, image=np.stack([f.image] * 4, axis=-1)), "wrong_type: shape (576, 768, 4)"),
-    "one dimension": (lambda f: replaced(f, image=f.image.ravel()), "wrong_type: shape (442368,)"),
     "a jaw opening of NaN": (lambda f: replaced(f, jaw_opening_m=math.nan), "jaw_opening"),
-    "a jaw opening in millimetres": (lambda f: replaced(f, jaw_opening_m=34.0), "jaw_opening: jaw opening 34 m"),
 }  # fmt: skip
 
 

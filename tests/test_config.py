@@ -68,21 +68,6 @@ def test_a_sound_configuration_means_what_it_says(folder: Path):
     np.testing.assert_allclose(config.cam_T_grip[:3, 3], [0.0, 0.0014, 0.1188])
 
 
-def test_prediction_agrees_with_the_pinhole_by_hand(folder: Path):
-    """One corner through rotation, projection and the lens's cubic (equation 4), without the package's own code."""
-    config = load_config(folder / "config.yaml")
-    view = config.view()
-    i = config.gripper.corner_ids.index("R_in_near")
-    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
-    x, y, z = 0.017, 0.0014 + c * -0.008, 0.1188 + s * -0.008
-    ideal = 962.0 * np.array([x / z, y / z])
-    radius = np.linalg.norm(ideal)
-    distorted_radius = next(r.real for r in np.roots([1.9e-7, 0.0, 1.0, -radius]) if abs(r.imag) < 1e-9)
-    np.testing.assert_allclose(view.corners_px[i], [383.5, 287.5] + ideal * distorted_radius / radius, atol=1e-6)
-    assert view.visible[i]
-    assert not view.visible[config.gripper.corner_ids.index("R_out_far")], "its own finger hides it"
-
-
 FAULTS = [
     # pattern, replacement, key, what must be said
     ("^robot:", "robbot:", "robbot", "did you mean 'robot'"),
@@ -354,12 +339,6 @@ def test_a_largest_sigma_is_refused_and_the_line_says_what_it_stood_for(folder: 
         load_config(path)
     # Of a normal distribution 1e-5 lies beyond 4.417 standard deviations, both tails together.
     assert stats.norm.isf(0.5 * PolicySettings().integrity_risk) == pytest.approx(4.42, abs=4e-3)
-
-
-def test_the_limits_are_the_defaults_without_a_word(folder: Path, caplog: pytest.LogCaptureFixture):
-    policy = load_config(folder / "config.yaml").settings.monitor.policy
-    assert (policy.alert_limit_m, policy.alert_limit_rad, policy.integrity_risk) == (1e-3, 0.035, 1e-5)
-    assert not caplog.messages
 
 
 def test_a_second_cameras_configuration_is_told_what_to_use_now(tmp_path: Path):

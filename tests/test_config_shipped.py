@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from gripmon.daemon.config import (
-    ConfigError,
     builtin_config,
     load_config,
-    load_scenario,
     read_gripper,
 )
 from gripmon.monitor import MonitorSettings
@@ -53,16 +51,6 @@ def test_adaptive_fingertips_stay_on_their_arc():
     distance_m = np.hypot(places[:, 0] - top_x_m, places[:, 2] - top_z_m + radius_m)
     assert np.ptp(places[:, 2]) > 0.009
     np.testing.assert_allclose(distance_m, radius_m, atol=0.0025**2 / 8 / 0.0573)
-
-
-def test_scenarios_load_and_refuse(tmp_path: Path):
-    path = tmp_path / "s.yaml"
-    path.write_text("name: mine\nduration_s: 2\nmount:\n  - {kind: bump, at_s: 1, tcp_shift_m: [0.0, 0.0045]}\n")
-    scenario = load_scenario(path)
-    assert (scenario.name, scenario.mount[0].tcp_shift_m) == ("mine", (0.0, 0.0045))
-    path.write_text("name: mine\nmount:\n  - {kind: bmp}\n")
-    with pytest.raises(ConfigError, match=r"mount\[0\].kind: is 'bmp', did you mean 'bump'"):
-        load_scenario(path)
 
 
 WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))

@@ -57,8 +57,3 @@ def test_faults_deep_inside_are_named_by_their_whole_key(value: object, key: str
         to_settings(value, _Outer)
     assert caught.value.fault.key == key
     assert said in str(caught.value)
-
-
-def test_typed_settings_keep_what_is_right():
-    value = to_settings({"rows": [[1, 2.5]], "inner": {"a": {"mode": "slow"}}, "either": "x"}, _Outer)
-    assert value == _Outer(rows=((1.0, 2.5),), inner={"a": _Inner(mode="slow")}, either="x")

@@ -101,30 +101,6 @@ def test_a_spline_through_points_of_an_arc_is_that_arc_to_a_micrometre():
     assert np.abs(np.einsum("ni,ni->n", across, radial)).max() < 0.01, "tangents are square to the radius"
 
 
-def test_tangents_are_derivatives_and_turn_with_the_frame():
-    model, _ = rounded(0.004)
-    rng = np.random.default_rng(2)
-    edge = rng.integers(0, len(model.edge_ids), 200)
-    fraction = rng.uniform(0.01, 0.99, 200)
-    cam_T_grip = nominal_cam_T_grip()
-    rotation = cam_T_grip[:3, :3]
-    points_m = model.points_grip_m(0.025) @ rotation.T + cam_T_grip[:3, 3]
-
-    def place(at: np.ndarray) -> np.ndarray:
-        start, end = model.tangents_m(points_m, edge, at, rotation)
-        return start + at[:, None] * (end - start)
-
-    start, end = model.tangents_m(points_m, edge, fraction, rotation)
-    by_differences = (place(fraction + 1e-6) - place(fraction - 1e-6)) / 2e-6
-    np.testing.assert_allclose(end - start, by_differences, atol=1e-7)
-    own, way = model.tangents_m(model.points_grip_m(0.025), edge, fraction)
-    np.testing.assert_allclose(
-        (own + fraction[:, None] * (way - own)) @ rotation.T + cam_T_grip[:3, 3], place(fraction), atol=1e-12
-    )
-    straight = ~model.edge_curved[edge]
-    np.testing.assert_array_equal(start[straight], points_m[model.edge_points[edge[straight], 0]])
-
-
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS], ids=["paper", "brown_conrady"])
 def test_the_jacobian_is_the_motion_of_the_curve_along_its_normal(lens: LensSettings):
     """The projected curve of a moved gripper, densely drawn, is intersected with each profile."""

@@ -158,14 +158,6 @@ def test_alerts_of_the_monitor_go_out_with_their_frame():
     assert bench.recording.alerts == [said]  # which has it in the frame's own record, and knows
 
 
-def test_a_new_revision_is_published_and_recorded():
-    bench = Bench(range(4), ScriptedMonitor(lambda seq: {"revision": 3 if seq < 2 else 4}))
-    bench.run()
-    assert [reference.revision for reference in bench.network.references] == [3, 4]
-    assert [reference.revision for reference in bench.recording.references] == [3, 4]
-    assert (4, 2) in [(state.revision, state.seq) for state in bench.network.states]
-
-
 def test_a_new_reference_is_known_before_anything_names_it():
     alert = Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.INFO, "new reference")
     bench = Bench(range(2), ScriptedMonitor(lambda seq: {"revision": 4, "alerts": (alert,)} if seq else {}))
@@ -252,12 +244,6 @@ def test_a_report_that_fails_stops_nothing(caplog: pytest.LogCaptureFixture):
     assert [record.seq for record in bench.network.transforms] == [0, 1, 2, 3]
     assert bench.states[1] == (State.TRACKING, "the line is cut")
     assert caplog.messages == ["a report for the state message fails: RuntimeError: the session is closed"]
-
-
-def test_without_a_feed_the_frames_opening_stays():
-    bench = Bench([Frame(0, 1, None, jaw_opening_m=0.03)])
-    bench.run()
-    assert bench.network.transforms[0].jaw_opening_m == 0.03
 
 
 @pytest.mark.parametrize(("opened", "length"), [(os.pipe, 20), (os.pipe, 9000), (os.openpty, 20), (os.openpty, 200)])

@@ -10,12 +10,10 @@ from support.daemon_bench import Bench
 from support.stand_ins import Listener, ScriptedMonitor
 
 from gripmon.model.records import (
-    Alert,
     AlertEvent,
     AlertKind,
     Cause,
     Origin,
-    Severity,
     State,
     Verdict,
 )
@@ -67,19 +65,6 @@ def test_a_broken_output_does_not_take_the_monitor_with_it(fails: str, caplog: p
     assert len(said) == 1, "an alert, once, in the log where no one else hears of it"
     if fails != "everything":
         assert bench.alerts == [(AlertKind.OUTPUT, Cause.UNKNOWN)]
-
-
-def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
-    alert = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
-    bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)}))
-    bench.network = Listener("Zenoh", fails="transform")
-    assert bench.run(estimates=tmp_path / "estimates.jsonl") == 0
-    assert [frame.seq for frame, _ in bench.recording.offered] == [0, 1, 2]
-    assert len((tmp_path / "estimates.jsonl").read_bytes().splitlines()) == 3
-    assert [said.kind for said in bench.network.alerts] == [AlertKind.STEP, AlertKind.OUTPUT, *[AlertKind.STEP] * 2]
-    assert bench.network.states[-1].frames == 3
-    assert bench.states[1] == (State.TRACKING, "Zenoh fails: OSError: the line is cut")
-    assert State.LOST not in [state for state, _ in bench.states]
 
 
 def test_a_broken_recorder_costs_the_network_nothing_and_its_end_is_said(caplog: pytest.LogCaptureFixture):

@@ -148,7 +148,7 @@ def test_the_words_are_those_of_the_field(page: Path):
 
 
 def test_files_that_pages_name_exist():
-    for page in PAGES:
+    for page in [*PAGES, ROOT / "README.md"]:
         named = set(re.findall(r"(?<![\w/.-])((?:configs|tools|tests|docs)/[\w./@-]*\w)(?![\w*])", page.read_text()))
         missing = {path for path in named if not (ROOT / path).exists() and "configs/zenoh/certificates" not in path}
         assert missing == set(), page.name

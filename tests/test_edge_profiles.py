@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from gripmon.track.edges.profiles import (
@@ -172,11 +171,3 @@ def test_grey_levels_that_are_not_finite_spoil_only_their_own_profiles():
     assert 0 < len(found.sample) < 60
     assert np.isfinite(found.offset_px).all() and np.isfinite(found.sigma_px).all()
     np.testing.assert_allclose(found.offset_px, whole.offset_px[found.sample], atol=1e-6)
-
-
-def test_colour_is_reduced_with_the_usual_weights():
-    rng = np.random.default_rng(4)
-    bgr = gaussian_filter(rng.uniform(size=(SIZE, SIZE, 3)), (1.0, 1.0, 0.0)) * 255.0
-    profiles = profiles_of(bgr.astype(np.float32), 33.0, np.zeros(60))
-    luma = bgr @ [0.114, 0.587, 0.299]
-    np.testing.assert_allclose(profiles, profiles_of(luma.astype(np.float32), 33.0, np.zeros(60)), atol=2e-3)

@@ -148,19 +148,6 @@ def test_no_modules_import_each_other_in_a_circle():
     assert circles_of(imports) == []
 
 
-@pytest.mark.parametrize(
-    ("imports", "expected"),
-    [
-        ({"a": {"b"}, "b": {"c"}, "c": set()}, []),
-        ({"a": {"b"}, "b": {"a"}, "c": {"a"}}, [["a", "b"]]),
-        ({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"e"}, "e": {"d"}}, [["a", "b", "c"], ["d", "e"]]),
-        ({"a": {"a"}}, [["a"]]),
-    ],
-)
-def test_circles_are_found(imports: dict[str, set[str]], expected: list[list[str]]):
-    assert circles_of(imports) == expected
-
-
 def test_the_package_itself_imports_no_room():
     """It only says where its names are; see tests/test_api.py."""
     body = ast.parse((PACKAGE / "__init__.py").read_text()).body

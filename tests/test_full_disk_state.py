@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
-from support.small_disks import small_disk
 from support.watched import frames_of, reference_of
 
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
 from gripmon.model.records import AlertEvent, AlertKind, Origin, ReferenceRecord
 from gripmon.monitor import Monitor, MonitorSettings
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    with small_disk(tmp_path / "disk", 1_000_000) as place:
-        yield place
 
 
 def test_what_could_not_be_kept_is_proposed_once_and_gets_into_force_when_it_can_be(monkeypatch: pytest.MonkeyPatch):

@@ -238,14 +238,6 @@ def test_polarity_counts_the_right_hand_of_somebody_walking_the_edge_as_positive
     assert gripper_from_dict(model).edge_polarity.tolist() == [-1, 1, 0] + [0] * 9
 
 
-def test_edges_at_a_corner_are_those_that_end_there():
-    gripper = gripper_from_dict(two_fingers_model())
-    for i, name in enumerate(gripper.corner_ids):
-        ends = {gripper.edge_ids[e] for e in gripper.edges_at_corner(i)}
-        assert ends == {e for e in gripper.edge_ids if name in e.split("-")}
-        assert len(ends) == 3
-
-
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
 def test_shipped_files_keep_their_order_and_their_bevels(path: Path):
     written = yaml.safe_load(path.read_text())

@@ -51,24 +51,6 @@ def test_a_creep_is_told_with_its_rate_and_its_beginning(seed: int, mm_per_min: 
     assert not history(shifts).is_step(TOWARDS)
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("size_sigma", [5.0, 50.0])
-def test_a_step_is_none(seed: int, size_sigma: float):
-    rng, t = np.random.default_rng(seed), times_s(40.0)
-    shifts = noise(rng, len(t))
-    shifts[t >= 25.3, 0] += size_sigma * SIGMA[0]
-    assert history(shifts).creep(TOWARDS) is None
-    assert history(shifts).is_step(TOWARDS)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_is_neither(seed: int):
-    rng = np.random.default_rng(seed)
-    still = history(noise(rng, 800))
-    assert still.creep(TOWARDS) is None
-    assert not still.is_step(TOWARDS)
-
-
 def test_a_creep_that_has_come_to_rest_is_over():
     rng, t = np.random.default_rng(1), times_s(100.0)
     shifts = noise(rng, len(t))

@@ -252,22 +252,6 @@ def test_tables(table: list[Row]):
         ), f"row {number}"
 
 
-@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
-def test_alerts_in_the_tables_live_once(table: list[Row]):
-    """Whatever happens: an id is raised before it is updated or cleared, and nothing is said of it afterwards."""
-    run, alive, dead = Run(), set[str](), set[str]()
-    for frame, *_ in table:
-        for alert in run.feed(frame).alerts:
-            assert alert.alert_id
-            assert (alert.alert_id in alive) == (alert.event is not RAISED)
-            assert alert.alert_id not in dead
-            alive.add(alert.alert_id)
-            if alert.event is CLEARED:
-                alive.remove(alert.alert_id)
-                dead.add(alert.alert_id)
-    assert {each.alert.alert_id for each in run.policy.alerts.open} == alive
-
-
 def test_standing_still_is_within_half_of_what_is_worth_a_warning():
     """Of where the transform came to rest, not of the frame before."""
     run = settled()

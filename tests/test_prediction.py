@@ -13,7 +13,6 @@ from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_
 from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.gripper import Gripper
-from gripmon.model.gripper.motion import offset_m
 from gripmon.track.edges.lines import CornerGeometry
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
@@ -79,62 +78,6 @@ def test_jacobian_is_the_motion_of_the_edge_along_its_normal(lens: LensSettings,
         np.testing.assert_allclose(prediction.jacobian[i] / scale, numeric / scale, atol=2e-5)
 
 
-def test_without_an_unknown_jaw_there_are_six_columns_and_the_same_ones():
-    six, seven = predicted(jaw_unknown=False), predicted()
-    assert six.jacobian.shape[1] == 6
-    np.testing.assert_array_equal(six.jacobian, seven.jacobian[:, :6])
-    assert np.abs(seven.jacobian[:, 6]).max() > 100.0, "px/m: half of an opening moves each finger"
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
-def test_normals_point_to_the_right_of_somebody_walking_along_the_edge(lens: LensSettings):
-    camera, gripper, prediction = make_camera(lens), box_gripper(), predicted(lens)
-    for i in range(0, len(prediction.uv_px), 5):
-        ends = ends_cam_m(gripper, prediction.layout.edge[i], nominal_cam_T_grip(), OPENING_M)
-        fraction = prediction.layout.fraction[i]
-        behind, here, ahead = camera.project(
-            ends[0] + np.array([[-1e-4], [0.0], [1e-4]]) * (ends[1] - ends[0]) + fraction * (ends[1] - ends[0])
-        )
-        np.testing.assert_allclose(prediction.uv_px[i], here, atol=1e-9)
-        walk = (ahead - behind) / np.linalg.norm(ahead - behind)
-        # The image's v axis points down: to the right of u is v.
-        np.testing.assert_allclose(prediction.normal[i], [-walk[1], walk[0]], atol=1e-6)
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
-def test_lines_and_gains_agree_with_undistorted_pixels(lens: LensSettings):
-    camera, prediction = make_camera(lens), predicted(lens)
-    edge = prediction.layout.edge
-    origin, direction = prediction.line_origin[edge], prediction.line_direction[edge]
-    right = np.column_stack([-direction[:, 1], direction[:, 0]])
-    on = camera.undistort(prediction.uv_px) - origin
-    np.testing.assert_allclose(np.einsum("ni,ni->n", on, right), 0.0, atol=1e-9)
-    np.testing.assert_allclose(np.einsum("ni,ni->n", on, direction), prediction.along, atol=1e-9)
-    off = camera.undistort(prediction.uv_px + 0.01 * prediction.normal) - camera.undistort(
-        prediction.uv_px - 0.01 * prediction.normal
-    )
-    np.testing.assert_allclose(np.einsum("ni,ni->n", off, right) / 0.02, prediction.gain, rtol=1e-5)
-    # An edge that isn't seen has no line.
-    hidden = np.setdiff1d(np.arange(len(prediction.line_origin)), edge)
-    assert len(hidden) and np.isnan(prediction.line_origin[hidden]).all()
-
-
-def test_maps_sample_along_the_normals():
-    prediction = predicted()
-    u = prediction.uv_px[:, :1] + prediction.normal[:, :1] * OFFSETS_PX
-    v = prediction.uv_px[:, 1:] + prediction.normal[:, 1:] * OFFSETS_PX
-    # In the middle row; the others lie a pixel beside it along the edge.
-    np.testing.assert_allclose(prediction.map_x[1], u, atol=1e-4)
-    np.testing.assert_allclose(prediction.map_y[1], v, atol=1e-4)
-    for row, sign in ((0, -1.0), (2, 1.0)):
-        beside = np.stack([prediction.map_x[row] - u, prediction.map_y[row] - v], axis=-1)
-        np.testing.assert_allclose(np.linalg.norm(beside, axis=-1), 1.0, atol=1e-3)
-        np.testing.assert_allclose(np.einsum("nsi,ni->ns", beside, prediction.normal), 0.0, atol=1e-3)
-        tangent = np.stack([prediction.normal[:, 1], -prediction.normal[:, 0]], axis=1)
-        assert (sign * np.einsum("nsi,ni->ns", beside, tangent) > 0.9).all()
-    np.testing.assert_allclose(OFFSETS_PX, np.arange(-7.0, 7.25, 0.5))
-
-
 @pytest.mark.parametrize("shift_m", [0.0, 0.01, 0.03], ids=["inside", "partly outside", "half outside"])
 def test_samples_lie_in_the_image_on_visible_outlines_away_from_their_ends(shift_m: float):
     camera, gripper = make_camera(PAPER_LENS), box_gripper()
@@ -167,19 +110,6 @@ def test_creases_are_sampled_when_asked_for():
     assert more and all(view.crease[e] for e in more)
 
 
-def test_short_edges_are_sampled_more_densely_than_long_ones():
-    prediction, gripper, camera = predicted(), box_gripper(), make_camera(PAPER_LENS)
-    edges, counts = np.unique(prediction.layout.edge, return_counts=True)
-    lengths = np.array(
-        [
-            np.linalg.norm(np.diff(camera.project(ends_cam_m(gripper, e, nominal_cam_T_grip(), OPENING_M)), axis=0))
-            for e in edges
-        ]
-    )
-    order = np.argsort(lengths)
-    assert counts[order[0]] / lengths[order[0]] > 1.3 * counts[order[-1]] / lengths[order[-1]]
-
-
 @pytest.mark.parametrize(
     "pose",
     [
@@ -195,16 +125,6 @@ def test_a_gripper_out_of_view_gives_an_empty_or_a_sound_prediction(pose: np.nda
     assert np.isfinite(prediction.uv_px[prediction.ok]).all()
     if not len(prediction.uv_px):
         assert prediction.map_x.size == 0 and prediction.moved_px(np.full(7, 1e-3)) == 0.0
-
-
-def test_moved_px_is_the_largest_motion_of_any_edge_point():
-    prediction = predicted()
-    shift = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    later = predicted(cam_T_grip=moved(nominal_cam_T_grip(), shift[:6]))
-    way = np.einsum("ni,ni->n", later.uv_px - prediction.uv_px, prediction.normal)
-    assert prediction.moved_px(shift) == pytest.approx(np.abs(way).max(), rel=0.02)
-    # 962 px focal length at about 115 mm
-    assert prediction.pixels_per_m == pytest.approx(962.0 / 0.115, rel=0.3)
 
 
 def test_a_gripper_without_faces_samples_all_its_edges():
@@ -247,13 +167,3 @@ def test_a_fit_that_leads_out_of_the_lens_is_only_a_bad_fit(seed: int):
     tcp_m = (*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.005, 0.02))
     found = measure(image, nominal_cam_T_grip(tilt_deg, tcp_m), using=meter(lens=WIDE_LENS))
     assert not found.trusted and np.isfinite(found.prediction.uv_px).all()
-
-
-def test_a_finger_is_where_its_table_has_it():
-    """Against NumPy's own interpolation, at the table's rows and between them; beyond its ends it goes on straight."""
-    table = np.array([[0.0, 0.0, 0.1, 0.2], [0.01, 1.0, 0.0, 0.3], [0.04, 4.0, -0.5, 0.1], [0.05, 3.0, 0.0, 0.0]])
-    np.testing.assert_allclose(offset_m(table, -0.01), [-1.0, 0.2, 0.1], atol=1e-15)
-    np.testing.assert_allclose(offset_m(table, 0.07), [1.0, 1.0, -0.2], atol=1e-14)
-    for opening_m in (0.0, 0.003, 0.01, 0.0399, 0.04, 0.05):
-        expected = [np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)]
-        np.testing.assert_allclose(offset_m(table, opening_m), expected, atol=1e-15)

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from support.grippers import gripper_from_dict
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
@@ -20,7 +19,7 @@ from gripmon.daemon.forecast import limits_warning
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Protection, ValidBy
-from gripmon.teach.accuracy import forecast_frame, with_bevels
+from gripmon.teach.accuracy import forecast_frame
 from gripmon.teach.kept import Kept, Sizes
 from gripmon.teach.visibility import Rig
 
@@ -149,17 +148,6 @@ def test_a_size_that_is_known_less_well_promises_less(tmp_path: Path, capsys: py
     path.write_text(DEMO.read_text().replace("gripper: grippers/two_box_fingers.yaml", "gripper: gripper.yaml"))
     assert main(["check", str(path)]) == 0
     assert "what helps most: its size measured better (a length, a plate: scale_sigma" in capsys.readouterr().out
-
-
-def test_bevels_widen_the_bound_by_what_the_gripper_file_could_say_of_them():
-    usual, cam_T_grip = rig()
-    model = msgspec.to_builtins(usual.gripper.model)
-    for edge in model["edges"].values():
-        edge["bevel_m"] = 2e-4
-    stated = usual._replace(gripper=gripper_from_dict(model))
-    assumed = usual._replace(gripper=with_bevels(usual.gripper, 2e-4))
-    bounds = [bound_of(each, cam_T_grip) for each in (stated, assumed, usual)]
-    assert bounds[0] == bounds[1] and bounds[1].position_m > 2.0 * bounds[2].position_m
 
 
 def test_bevels_that_are_stated_but_not_taught_ask_for_teaching_and_not_for_another_mount(

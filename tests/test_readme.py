@@ -48,12 +48,6 @@ def test_the_readme_is_short():
     assert len(TEXT.encode()) <= 10_000
 
 
-def test_files_that_are_named_exist():
-    paths = set(re.findall(r"(?<![\w/.])((?:configs|tools|tests|docs)/[\w./]*\w)", TEXT))
-    assert len(paths) > 6
-    assert not [path for path in paths if not (ROOT / path).exists()]
-
-
 def test_settings_that_are_named_exist():
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     sections = "monitor|publish|jaw|reference|state|recording|daemon|view|metrics|ros2"

@@ -15,7 +15,7 @@ from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibra
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool
 from gripmon.judge.recalibrate.recalibrator import UNLIKELY_RESIDUALS_RISK
 from gripmon.judge.recalibrate.stills import LASTING_SHARE as LASTING_PART
-from gripmon.judge.recalibrate.stills import NEIGHBOURS, average, averaged_covariance, mean_corners
+from gripmon.judge.recalibrate.stills import average, averaged_covariance, mean_corners
 from gripmon.model.geometry import perturb, perturbation_between
 
 SURE = RecalibrationSettings(sure_sigma_m=1e-4)
@@ -73,28 +73,6 @@ def test_the_covariance_is_that_of_the_error():
     assert 0.4 < np.mean(squares) < 1.25
 
 
-def white(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:
-    """(n, m) with exactly this scatter, neighbours alternating."""
-    values = rng.normal(size=(count // 2, len(covariance))) * np.array([1.0, -1.0])[:, None, None]
-    values = values.transpose(1, 0, 2).reshape(count, -1)
-    values = np.linalg.solve(np.linalg.cholesky(np.cov(values.T)), values.T).T
-    return values @ np.linalg.cholesky(covariance).T
-
-
-def test_only_what_scatters_is_averaged_away():
-    rng = np.random.default_rng(1)
-    claimed = np.diag([4.0, 1.0, 9.0])
-    np.testing.assert_allclose(averaged_covariance(claimed, np.ones((50, 3)), 50), claimed, atol=1e-12)
-    half = averaged_covariance(claimed, white(rng, 0.5 * claimed, 50), 50)
-    np.testing.assert_allclose(half, claimed * (0.5 + 0.5 * NEIGHBOURS / 50), atol=1e-12)
-    all_of_it = averaged_covariance(claimed, white(rng, claimed, 50), 100)
-    np.testing.assert_allclose(all_of_it, claimed * (LASTING_PART + NEIGHBOURS / 100), atol=1e-12)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    values = white(rng, np.diag([0.4, 0.8, 3.0]), 20)
-    there = averaged_covariance(turn @ claimed @ turn.T, values @ turn.T, 20)
-    np.testing.assert_allclose(there, turn @ averaged_covariance(claimed, values, 20) @ turn.T, atol=1e-12)
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
 def test_frames_that_err_alike_count_as_fewer(correlation: float):
     """Averages of series whose neighbours are correlated: their scatter is what a single series says, or less."""
@@ -143,18 +121,6 @@ def test_frames_that_show_the_gripper_elsewhere_do_not_pull_the_average():
     with_two = average(frames, 60)
     assert with_two.outlying == pytest.approx(2 / 24)
     assert np.linalg.norm(with_two.cam_T_grip[:3, 3] - clean.cam_T_grip[:3, 3]) < 3e-6
-
-
-@pytest.mark.parametrize("openings_m", [(None,), (0.02, 0.025, 0.034, 0.045)], ids=["jaw rests", "jaw moves"])
-def test_mean_corners_are_the_corners_of_one_gripper_at_the_mean_opening(openings_m: tuple[float | None, ...]):
-    scene = Scene(openings_m=openings_m, corner_px=0.02)
-    frames = scene.frames(20)
-    wrong_T = perturb(TRUE_T, np.array([5e-5, -3e-5, 5e-5, 2e-4, 0.0, 1e-4]))
-    corners = mean_corners(frames, wrong_T)
-    off_px = 962.0 * (corners.xy - image(corners.points_grip_m, TRUE_T))
-    assert np.abs(off_px).max() < 0.08, "also when the pose that carries them is a twentieth of a millimetre off"
-    sigma_px = 962.0 * np.sqrt(corners.covariance_xy.diagonal())
-    assert (sigma_px > 0.01).all() and (sigma_px < 0.025).all()
 
 
 @pytest.mark.parametrize("off_px", [0.3, 30.0])
@@ -369,37 +335,6 @@ def test_the_newest_frames_count_and_forgetting_begins_anew():
     recalibrator.forget()
     assert recalibrator.frames == 0
     assert isinstance(recalibrator.outcome(reference()), Refusal)
-
-
-def test_leaving_an_edge_out_moves_the_pose_as_a_fit_without_it():
-    frames = Scene().frames(20)
-    pooled = pool(frames, TRUE_T)
-    rows, values, edges = [], [], []
-    scale = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-    for frame in frames:
-        assert frame.edges is not None
-        shift = perturbation_between(frame.cam_T_grip, TRUE_T)
-        for k in range(len(frame.edges.edge)):
-            # Each stretch as a square root of its information: the same normal equations.
-            moment = scale * (frame.edges.moment[k] - frame.edges.information[k] @ shift)
-            size, axes = np.linalg.eigh(frame.edges.information[k] * np.outer(scale, scale))
-            root = np.sqrt(np.maximum(size, 0.0))[:, None] * axes.T
-            rows.append(root)
-            values.append(np.linalg.lstsq(root.T, moment, rcond=1e-9)[0])
-            edges += [int(frame.edges.edge[k])] * 6
-    matrix, right, edge = np.concatenate(rows), np.concatenate(values), np.array(edges)
-
-    def fit(kept: np.ndarray) -> np.ndarray:
-        return scale * np.linalg.lstsq(matrix[kept], right[kept], rcond=None)[0]
-
-    whole = fit(np.ones(len(edge), dtype=bool))
-    names = np.unique(edge)
-    expected = (
-        sum(np.outer(d, d) for d in (fit(edge != name) - whole for name in names)) * (len(names) - 1) / len(names)
-    )
-    np.testing.assert_allclose(
-        leave_one_out(pooled) / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=1e-3
-    )
 
 
 def test_without_edges_nothing_is_sure():

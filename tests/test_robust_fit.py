@@ -96,16 +96,6 @@ def miss_px(consensus: RobustFit, xi: np.ndarray = XI) -> float:
     return float(np.abs(PREDICTION.jacobian @ (consensus.xi - xi)).max())
 
 
-def test_exact_candidates_give_the_exact_motion():
-    consensus = fit(true_candidates(np.random.default_rng(1), sigma_px=0.0))
-    # All but the jaw opening, which the prior holds near the reported one.
-    assert miss_px(consensus) < 5e-3
-    assert consensus.share == 1.0 and consensus.supported.all()
-    sampled = np.unique(PREDICTION.layout.edge)
-    assert consensus.edge_seen[sampled].all()
-    assert not consensus.edge_seen[np.setdiff1d(np.arange(EDGES), sampled)].any()
-
-
 @pytest.mark.parametrize(
     ("missing", "extra", "mean_px", "max_px"),
     [(0.3, 0.0, 0.1, 0.25), (0.0, 0.5, 0.1, 0.25), (0.3, 0.5, 0.15, 0.4), (0.3, 1.5, 0.35, 0.8)],
@@ -130,15 +120,6 @@ def with_background_edge(edge: int, beside_px: float, true_one_seen: bool) -> Ca
     trap_px = offset_px[mine] + beside_px
     kept = np.arange(SAMPLES) if true_one_seen else np.setdiff1d(np.arange(SAMPLES), mine)
     return candidates(np.concatenate([kept, mine]), np.concatenate([offset_px[kept], trap_px]))
-
-
-@pytest.mark.parametrize("beside_px", [-2.5, 1.5])
-def test_an_edge_of_the_background_beside_one_of_the_gripper_does_not_move_the_fit(beside_px: float):
-    """The trap for lines that are fitted one by one: complete, parallel, and maybe closer to the prediction."""
-    for edge in SAMPLED:
-        consensus = fit(with_background_edge(edge, beside_px, true_one_seen=True))
-        assert miss_px(consensus) < 0.25
-        assert consensus.edge_seen[SAMPLED].all()
 
 
 AMBIGUOUS = {(f"{side}_{edge}_along", 1.5) for side in "LR" for edge in ("in_far", "out_near")}
@@ -244,28 +225,6 @@ def test_an_edge_counts_as_seen_by_what_exceeds_chance_and_its_scatter(
     assert least <= seen_in_texture(true_share, texture) <= most
 
 
-def test_an_edge_that_chance_alone_supports_does_not_count_as_seen():
-    """In dense texture a third of the profiles has a candidate near any line at all."""
-    rng = np.random.default_rng(10)
-    seen = 0
-    for trial in range(40):
-        edge = SAMPLED[trial % len(SAMPLED)]
-        mine = np.flatnonzero(PREDICTION.layout.edge == edge)
-        offset_px = PREDICTION.jacobian @ XI + rng.normal(scale=0.1, size=SAMPLES)
-        kept = np.setdiff1d(np.arange(SAMPLES), mine)
-        texture = np.repeat(mine, 6)
-        random_px = rng.uniform(-REACH_PX, REACH_PX, len(texture))
-        consensus = fit(candidates(np.concatenate([kept, texture]), np.concatenate([offset_px[kept], random_px])))
-        assert consensus.edge_share[edge] > SETTINGS.support_share
-        assert consensus.edge_seen[kept_edges(edge)].all()
-        seen += consensus.edge_seen[edge]
-    assert seen <= 2
-
-
-def kept_edges(edge: int) -> np.ndarray:
-    return np.setdiff1d(SAMPLED, edge)
-
-
 def test_clutter_alone_is_never_trusted():
     rng = np.random.default_rng(5)
     for density in (0.5, 1.0, 2.0, 3.0):
@@ -297,53 +256,6 @@ def test_the_grid_finds_what_is_out_of_the_reach_of_the_start():
     best = fit_irls_from_grid(votes_for(found), REPORTED, starts, SETTINGS)
     assert miss_px(best, far) < 0.4
     assert best.share > 0.8 > fit(found).share
-
-
-def test_the_grid_shifts_turns_and_scales_the_image_by_what_it_says():
-    starts = grid_of_starts(PREDICTION, 6.0, 2.0)
-    assert len(starts) == 7 * 7 * 3 * 3
-    assert not starts[:, [3, 4, 6]].any(), "tilts and the jaw are left to the fit"
-    only_x = np.zeros(7)
-    only_x[0] = 2.0 / PREDICTION.pixels_per_m
-    assert (np.abs(starts - only_x).max(axis=1) < 1e-12).any()
-    # No start moves the image by more than its parts together.
-    assert np.abs(starts @ PREDICTION.jacobian.T).max() < 3.0 * 6.0
-
-
-def test_polarity_discards_candidates_of_the_wrong_sign():
-    """The positive sign is "brighter to the right of someone walking along the edge"."""
-    edge = int(PREDICTION.layout.edge[0])
-    polarity = ANY.copy()
-    polarity[edge] = 1
-    found = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), step=-40.0)
-    weights = weigh(found, PREDICTION, polarity, SETTINGS).weight
-    mine = PREDICTION.layout.edge[found.sample] == edge
-    assert (weights[mine] == 0.0).all() and (weights[~mine] > 0.0).all()
-    brighter = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), step=40.0)
-    assert (weigh(brighter, PREDICTION, polarity, SETTINGS).weight > 0.0).all()
-    assert (weigh(brighter, PREDICTION, -polarity, SETTINGS).weight[mine] == 0.0).all()
-
-
-def test_candidates_of_the_wrong_sign_do_not_count_even_where_they_lie_right():
-    polarity = np.ones(EDGES, dtype=np.int8)
-    offset_px = PREDICTION.jacobian @ XI
-    found = candidates(np.arange(SAMPLES), offset_px, step=-40.0)
-    consensus = fit_irls(votes_for(found, polarity=polarity), REPORTED, np.zeros(7), SETTINGS)
-    assert consensus.share == 0.0 and not consensus.supported.any()
-
-
-def test_points_of_one_edge_together_are_worth_no_more_than_the_edge_itself():
-    """Variance of their mean: the edge's own, plus that of points over the number of independent ones."""
-    spread_px = np.full(EDGES, 0.03)
-    spread_px[int(PREDICTION.layout.edge[-1])] = 0.3
-    found = candidates(np.arange(SAMPLES), np.zeros(SAMPLES), sigma_px=0.12)
-    settings = RobustFitSettings(point_floor_px=0.05)
-    consensus = fit_irls(votes_for(found, settings, edge_spread_px=spread_px), REPORTED, np.zeros(7), settings)
-    for e in np.unique(PREDICTION.layout.edge):
-        mine = PREDICTION.layout.edge[found.sample] == e
-        independent = np.count_nonzero(mine) * PREDICTION.independence[e]
-        variance = spread_px[e] ** 2 + (0.12**2 + 0.05**2) / independent
-        assert consensus.weight[mine].sum() == pytest.approx(1.0 / variance)
 
 
 def test_the_prior_holds_the_jaw_at_what_is_reported():

@@ -10,22 +10,18 @@ from support.meters import (
     EVERYWHERE,
     NARROW,
     box_gripper,
-    corners_px,
     difference,
     measure,
     meter,
     moved,
     picture,
-    simulated,
 )
 from support.simulated import PAPER_LENS, box_model, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
 from gripmon.simulate import make_scenario
 from gripmon.track.edges import Effort, Measurement
-from gripmon.track.edges.hypotheses import outline_points
-from gripmon.track.edges.reduced import evidence_maps, rectify, window_about
-from gripmon.track.edges.search import _Place, search_poses
+from gripmon.track.edges.search import search_poses
 from gripmon.track.edges.settings import SearchSettings
 
 SETTINGS = SearchSettings()
@@ -95,36 +91,6 @@ def searched(image: np.ndarray, expected: np.ndarray, settings: SearchSettings =
     return search_poses(image, make_camera(PAPER_LENS), box_gripper(), expected, 0.034, settings)
 
 
-def outline_misses_px(pose: np.ndarray, true: np.ndarray) -> float:
-    """Largest way of a visible corner between two poses, px."""
-    uv, goal = (corners_px(make_camera(PAPER_LENS), box_gripper(), p) for p in (pose, true))
-    facing = ["far" not in name or "in" in name for name in box_gripper().corner_ids]
-    return float(np.linalg.norm((uv - goal)[facing], axis=1).max())
-
-
-def test_a_proposed_pose_puts_the_gripper_where_it_is():
-    """On even ground one of the best must lie within what the fit can bridge, tilts included."""
-    image, true = picture(plain_scenario()), nominal_cam_T_grip()
-    for xi in jumps(np.random.default_rng(14), 12):
-        poses = searched(image, moved(true, xi))
-        assert 0 < len(poses) <= SETTINGS.starts
-        assert min(outline_misses_px(pose, true) for pose in poses[:3]) < 7.0
-
-
-@pytest.mark.parametrize("shift_m", [(0.0, -0.009, 0.0), (0.006, 0.006, -0.008)])
-def test_the_votes_know_that_what_is_nearer_is_shifted_by_more(shift_m: tuple[float, float, float]):
-    """Fingers 40 mm long at 115 mm: a shift and a scale of the image leave up to 3.3 cells."""
-    image, expected = picture(plain_scenario()), nominal_cam_T_grip()
-    camera, gripper, true = make_camera(PAPER_LENS), box_gripper(), expected.copy()
-    expected[:3, 3] -= shift_m
-    points = outline_points(camera, gripper, expected, 0.034, 60.0, 80)
-    place = _Place(expected, points, SETTINGS)
-    window = window_about(camera, place.xy, place.reach_m / place.depth_m, SETTINGS.coarse_columns)
-    voted = place.voted(evidence_maps(*rectify(image, camera, window)), window)
-    misses_px = [outline_misses_px(pose, true) for pose in voted.matrices()[:8]]
-    assert min(misses_px) < 1.5 * window.pitch * camera.fx_px
-
-
 def test_edges_that_never_show_in_place_are_not_asked_for_elsewhere():
     """Without faces a file doesn't say which of its edges the fingers hide themselves."""
     model = box_model()
@@ -178,14 +144,6 @@ def test_nothing_is_searched_for_when_nothing_can_be_seen():
     assert not measure(image, pose, patience=EVERYWHERE).trusted
 
 
-def test_a_search_in_a_meter_leaves_nothing_behind():
-    image, true, used = picture(make_scenario("static"), 0, 3), nominal_cam_T_grip(), meter()
-    first = measure(image, using=used)  # its profiles lie a little elsewhere than those after a search
-    measure(image, moved(true, np.array([0.008, -0.006, 0.0, 0.0, 0.0, 0.05])), using=used, patience=EVERYWHERE)
-    again = difference(first.cam_T_grip, measure(image, using=used).cam_T_grip)
-    assert (np.abs(again) < 0.6 * np.sqrt(np.diag(first.covariance)[:6])).all()
-
-
 @pytest.mark.parametrize("kind", ["colour", "uint16", "float32"])
 def test_other_kinds_of_images_are_searched_as_well(kind: str):
     image = picture(make_scenario("static"), 0, 3)
@@ -205,7 +163,3 @@ def test_pixels_that_are_not_finite_do_not_stop_a_search():
     xi = np.array([0.007, -0.005, 0.003, 0.0, 0.0, 0.04])
     got = measure(image, moved(nominal_cam_T_grip(), xi), patience=EVERYWHERE)
     assert got.trusted and is_true(got, nominal_cam_T_grip())
-
-
-def test_simulated_truth_is_what_the_tests_take_it_for():
-    np.testing.assert_allclose(simulated(make_scenario("bump"), 3).truth(0).cam_T_grip, nominal_cam_T_grip())

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import yaml
 from support import new_user
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+from support.simulated import BOX_FINGERS
 
 from gripmon.cli import main
-from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid
-from gripmon.simulate import CALIBRATION_KINDS, Rig, image_count
-from gripmon.simulate.calibration_images import rough_corners
+from gripmon.simulate import CALIBRATION_KINDS, image_count
 from gripmon.simulate.laser import paper_cell, poses_on_plane, spot_image, spots_cam_m
 from gripmon.simulate.plates import Plate, Print, facing, points_of
 
@@ -69,34 +67,6 @@ def test_marks_are_read_by_opencv_with_their_corners():
     points = board.getChessboardCorners()[ids.ravel()] @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
     true = PINHOLE.fx_px * points[:, :2] / points[:, 2:] + [PINHOLE.cx_px, PINHOLE.cy_px]
     assert np.abs(np.reshape(corners, (-1, 2)) - true).max() < 0.3
-
-
-@pytest.mark.parametrize("target", [CircleGrid(8, 6, 0.02, 0.01), BOARD])
-def test_two_samples_a_pixel_are_as_exact_as_many(target):
-    plate = Plate(target, facing(target, (0.0, 0.0, 0.4), (0.4, 0.2), 0.3))
-    few, many = plate.light(PAPER_LENS, 0.6), plate.light(PAPER_LENS, 0.6, samples=6)
-    assert np.abs(few - many).mean() < 0.15
-    assert np.percentile(np.abs(few - many), 99.0) < 4.0  # of a step of 160
-
-
-def test_rough_corners_are_those_of_the_named_places():
-    rig = Rig(make_camera(PAPER_LENS), read_gripper(BOX_FINGERS), nominal_cam_T_grip())
-    assert rig.jaw_opening_m == pytest.approx(0.05)
-    true, rough = rough_corners(
-        rig.camera, rig.gripper, rig.cam_T_grip, rig.jaw_opening_m, np.random.default_rng(1), off_px=4.0
-    )
-    half, deep = 0.5 * rig.jaw_opening_m, 0.008
-    by_hand = {
-        "left_inner_near": (-half, -deep, 0.0), "left_inner_far": (-half, deep, 0.0),
-        "left_outer_near": (-half - 0.01, -deep, 0.0), "left_rise_far": (-half, deep, -0.014),
-        "right_inner_near": (half, -deep, 0.0), "right_inner_far": (half, deep, 0.0),
-        "right_outer_near": (half + 0.01, -deep, 0.0), "right_rise_far": (half, deep, -0.014),
-    }  # fmt: skip
-    assert set(true) == set(rough) == set(by_hand)
-    for name, point in by_hand.items():
-        uv = rig.camera.project((rig.cam_T_grip[:3, :3] @ point + rig.cam_T_grip[:3, 3])[None])[0]
-        assert true[name] == pytest.approx(uv, abs=1e-6)
-        assert 0.0 < np.abs(rough[name] - uv).max() < 4.0
 
 
 def test_spots_lie_on_the_plane_and_on_the_beam():

@@ -21,12 +21,11 @@ from gripmon.daemon.config import read_gripper
 from gripmon.io.sources import (
     SimulatedSettings,
     SourceError,
-    SourceSettings,
     Waiting,
     make_simulator,
     open_source,
 )
-from gripmon.io.sources.realtime import SimulatedCamera, _Schedule
+from gripmon.io.sources.realtime import SimulatedCamera
 from gripmon.io.sources.simulated import SimulatedSequence
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
@@ -73,31 +72,6 @@ def frames_of(camera: SimulatedCamera, count: int) -> list[Frame]:
 
 
 # --- which frame comes next ---
-
-
-@pytest.mark.parametrize(
-    ("first", "step", "index", "elapsed_frames", "expected"),
-    [
-        (0, 1, 0, 0.0, 1),
-        (0, 1, 0, 1.9, 1),
-        (0, 1, 0, 2.1, 2),
-        (0, 1, 4, 9.5, 9),
-        (0, 2, 0, 0.5, 2),
-        (0, 2, 0, 2.9, 2),
-        (0, 2, 0, 3.1, 4),
-        (1, 2, 1, 3.9, 3),
-        (1, 2, 1, 8.0, 9),
-        (2, 3, 5, 11.5, 11),
-        (2, 3, 5, 12.0, 14),
-    ],
-)
-def test_frames_whose_time_is_over_are_left_out(
-    first: int, step: int, index: int, elapsed_frames: float, expected: int
-):
-    schedule = _Schedule(64.0, first, step, None)  # a rate without rounding
-    following = schedule.following(index, elapsed_frames / 64.0)
-    assert following == expected
-    assert following % step == first and following > index and following >= int(elapsed_frames)
 
 
 # --- real time ---
@@ -313,10 +287,3 @@ def test_scenarios_that_can_not_be_are_refused_in_one_line(
 def test_without_a_scene_there_is_nothing_to_simulate():
     with pytest.raises(SourceError, match="scene"):
         open_source(SimulatedSettings())
-
-
-def test_simulator_settings_are_checked():
-    assert msgspec.convert({"kind": "simulator", "seed": 4}, SourceSettings) == SimulatedSettings(seed=4)
-    for wrong in ({"fps": 0}, {"processes": 9}, {"seed": -1}, {"speed": 2}, {"scenario": ""}):
-        with pytest.raises(msgspec.ValidationError):
-            msgspec.convert({"kind": "simulator", **wrong}, SourceSettings)

@@ -8,11 +8,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import PLAIN_FINGERS, plain_scenario, simulator
 
 from gripmon.simulate import Hidden
 from gripmon.simulate.scenario import (
-    Cover,
     FingerMark,
     FingerShape,
     GraspedObject,
@@ -73,13 +72,6 @@ def test_a_pad_ends_where_its_geometry_says() -> None:
         assert crossing(image, a, b) * np.linalg.norm(b - a) == pytest.approx(expected, abs=0.35)
 
 
-def test_a_mark_of_one_finger_leaves_the_other_and_the_outlines_alone() -> None:
-    tone = FingerMark(from_tip_m=(0.01, 0.2), across=(-1.2, 1.2), gain=0.5, finger="left")
-    image, plain = (simulator(plain_scenario(fingers=look)).light(0) for look in (fingers(marks=(tone,)), fingers()))
-    changed = np.abs(image - plain) > 1.0
-    assert changed[:, :384].sum() > 5000 and not changed[:, 384:].any()
-
-
 def test_marks_move_with_the_fingers() -> None:
     disc = FingerMark(shape="disc", from_tip_m=(0.006, 0.012), across=(0.0, 0.0), gain=2.0)
     jaw = JawScript(knots=((0.0, 0.034), (1.0, 0.02)))
@@ -129,12 +121,6 @@ def test_a_bar_before_the_tips_hides_them_while_it_is_there() -> None:
     assert np.array_equal(sim.light(0), sim.light(4)) and not np.array_equal(sim.light(0), sim.light(2))
 
 
-def test_one_finger_hidden_by_a_box_leaves_the_other() -> None:
-    box = Prop(size_m=(0.03, 0.02, 0.05), centre_m=(-0.025, -0.025, -0.018))
-    seen = outline_seen(simulator(plain_scenario(props=(box,))), 0)
-    assert seen.tips[0] < 0.2 and seen.tips[1] == 1.0
-
-
 def test_copies_and_mirror_images_look_like_the_fingers() -> None:
     opening = JawScript(knots=((0.0, 0.03),))
     copies = simulator(plain_scenario(props=(Prop(shape="fingers", centre_m=(0.0, 0.0, 0.03)),), jaw=opening))
@@ -171,23 +157,3 @@ def test_a_sharp_shadow_stands_where_it_was_put() -> None:
     assert len(dark) == pytest.approx(0.3 * 768, abs=4) and dark.mean() == pytest.approx(287.5, abs=2.0)
     assert np.count_nonzero((ratio > 0.45) & (ratio < 0.95)) <= 8
     assert np.array_equal(sim.render(1)[:, 10] < 100, sim.render(5)[:, 10] < 100)
-
-
-def test_covers_count_in_what_is_seen_of_the_outline() -> None:
-    sim = simulator(plain_scenario(covers=(Cover(start_s=0.5, end_s=9.0, move_s=0.2),), fps=1.0))
-    assert outline_seen(sim, 0).tips.min() == 1.0
-    assert outline_seen(sim, 4).tips.max() == 0.0 and outline_seen(sim, 4).edges.max() == 0.0
-
-
-def test_what_is_off_leaves_pictures_as_they_were() -> None:
-    looks = (PLAIN_FINGERS, msgspec.structs.replace(PLAIN_FINGERS, marks=(), shape=FingerShape()))
-    prop = Prop(start_s=50.0)
-    images = [simulator(plain_scenario(fingers=look, props=p)).render(2) for look in looks for p in ((), (prop,))]
-    assert all(np.array_equal(images[0], image) for image in images[1:])
-
-
-def test_what_the_camera_sees_agrees_with_the_pose() -> None:
-    """The tests above look at the near faces: they face the camera in the pose that they share."""
-    cam_T_grip = nominal_cam_T_grip()
-    eye = -cam_T_grip[:3, :3].T @ cam_T_grip[:3, 3]
-    assert eye[1] < -0.02

@@ -9,13 +9,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from support.box_models import random_rotation
 
-from gripmon.judge import smoothing
-from gripmon.judge.smoothing import SETTLING_FRAMES, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
+from gripmon.judge.smoothing import PoseAverage, PoseFilter, QuietTime, SmoothingSettings
 
 SETTINGS = SmoothingSettings()
 PERIOD_S = 1.0 / 60.0
@@ -71,18 +69,6 @@ def test_a_pose_that_stands_still_is_averaged_and_its_covariance_falls_with_the_
     np.testing.assert_allclose(difference(TRUE, filtered.mean_T)[3:], errors.mean(axis=0)[3:], atol=1e-6)
 
 
-def test_measurements_of_unequal_worth_are_weighted_by_their_information():
-    rng = np.random.default_rng(4)
-    covariances = [spread(scale=rng.uniform(0.3, 3.0), seed=k) for k in range(12)]
-    xis = [noise(rng, covariance, 1)[0] for covariance in covariances]
-    filtered = run_filter([moved(TRUE, xi) for xi in xis], covariances)
-    information = sum(np.linalg.inv(c) for c in covariances)
-    expected = np.linalg.solve(information, sum(np.linalg.solve(c, xi) for c, xi in zip(covariances, xis, strict=True)))
-    np.testing.assert_allclose(filtered.covariance, np.linalg.inv(information), rtol=1e-6, atol=1e-20)
-    np.testing.assert_allclose(difference(TRUE, filtered.mean_T)[:3], expected[:3], atol=2e-8)
-    np.testing.assert_allclose(difference(TRUE, filtered.mean_T)[3:], expected[3:], atol=1e-6)
-
-
 def test_a_wandering_pose_is_what_batch_least_squares_over_all_frames_makes_of_it():
     """All poses of the way as unknowns, measured and tied to their neighbours by the walk: the newest's estimate."""
     rng, count = np.random.default_rng(6), 25
@@ -107,38 +93,6 @@ def test_a_wandering_pose_is_what_batch_least_squares_over_all_frames_makes_of_i
     np.testing.assert_allclose(filtered.covariance, covariance[-6:, -6:] * np.outer(unit, unit), rtol=1e-6, atol=1e-20)
     np.testing.assert_allclose(difference(TRUE, filtered.mean_T)[:3], expected[:3], atol=2e-8)
     np.testing.assert_allclose(difference(TRUE, filtered.mean_T)[3:], expected[3:], atol=2e-6)
-
-
-def test_with_creep_the_covariance_settles_at_the_riccati_equations_solution():
-    covariance, walk = spread(), np.square([2e-5] * 3 + [3e-4] * 3) * PERIOD_S
-    filtered = run_filter([TRUE] * 3000, [covariance] * 3000, walk)
-    scale = np.sqrt(np.diag(covariance))  # The solver wants comparable units.
-    units = np.outer(scale, scale)
-    before = solve_discrete_are(np.eye(6), np.eye(6), np.diag(walk) / units, covariance / units) * units
-    after = before - before @ np.linalg.solve(before + covariance, before)
-    np.testing.assert_allclose(filtered.covariance, after, rtol=1e-6, atol=1e-9 * after.max())
-    # The scalar form of the same for one axis of uncorrelated noise.
-    filtered = run_filter([TRUE] * 3000, [np.diag(np.diag(covariance))] * 3000, walk)
-    q, r = walk[2], covariance[2, 2]
-    assert filtered.covariance[2, 2] == pytest.approx(0.5 * (np.sqrt(q * q + 4.0 * q * r) - q), rel=1e-6)
-
-
-def test_innovations_of_honest_measurements_have_the_size_that_is_expected():
-    covariance, walk = spread(), np.square([3e-5] * 3 + [1e-3] * 3) * PERIOD_S
-    rng = np.random.default_rng(5)
-    truth = np.cumsum(rng.normal(size=(2500, 6)) * np.sqrt(walk), axis=0)
-    errors = noise(rng, covariance, 2500)
-    filtered, sizes, nees = PoseFilter(moved(TRUE, truth[0] + errors[0]), covariance), [], []
-    for true, error in zip(truth[1:], errors[1:], strict=True):
-        filtered.wander(walk)
-        innovation, gain, size = filtered.weigh(moved(TRUE, true + error), covariance)
-        filtered.correct(innovation, gain)
-        sizes.append(size)
-        miss = difference(filtered.mean_T, moved(TRUE, true))
-        nees.append(miss @ np.linalg.solve(filtered.covariance, miss))
-    assert np.mean(sizes) == pytest.approx(6.0, abs=4.5 * np.sqrt(12.0 / 2500.0))
-    # Neighbours are correlated over some ten frames at most.
-    assert np.mean(nees[20:]) == pytest.approx(6.0, abs=4.5 * np.sqrt(12.0 / 250.0))
 
 
 def test_a_covariance_that_is_not_positive_definite_is_refused():
@@ -370,37 +324,3 @@ def test_vibration_is_not_hidden():
     assert rms(miss)[1] < 1.2 * rms(errors[late])[1]
     assert (rms(miss)[[0, 2]] < 0.9 * rms(errors[late])[[0, 2]]).all()
     assert np.mean(miss[:, 1] ** 2 / claimed[late, 1, 1]) < 1.3
-
-
-def test_waiting_grows_the_variance_with_time_however_it_is_cut_up():
-    once, often, covariance = PoseFilter(TRUE, spread()), PoseFilter(TRUE, spread()), spread()
-    variance = np.square([1e-5] * 3 + [1e-4] * 3)
-    once.wander(4.0 * variance)
-    for _ in range(100):
-        often.wander(0.04 * variance)
-    np.testing.assert_allclose(once.covariance, often.covariance, rtol=1e-12)
-    np.testing.assert_allclose(once.covariance - covariance, np.diag(4.0 * variance), rtol=1e-9, atol=1e-24)
-
-
-def test_what_is_handed_over_is_not_changed():
-    covariance, pose = spread(), TRUE.copy()
-    given = covariance.copy()
-    average = PoseAverage(SETTINGS)
-    for _ in range(SETTLING_FRAMES + 5):
-        average.wander(1.0)
-        average.add(pose, covariance)
-    np.testing.assert_array_equal(covariance, given)
-    np.testing.assert_array_equal(pose, TRUE)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_compiled_gain_is_that_of_the_covariances(seed: int):
-    rng = np.random.default_rng(seed)
-    mine, other = spread(1.0, seed), spread(10.0 ** rng.uniform(-2.0, 2.0), seed + 10)
-    innovation = rng.normal(size=6) * np.sqrt(mine.diagonal())
-    gain, surprise = smoothing._gain(mine, other, innovation)
-    expected = mine @ np.linalg.inv(mine + other)
-    unit = np.sqrt(mine.diagonal())
-    np.testing.assert_allclose(gain * unit / unit[:, None], expected * unit / unit[:, None], rtol=0.0, atol=1e-9)
-    assert surprise == pytest.approx(innovation @ np.linalg.solve(mine + other, innovation), rel=1e-6)
-    assert smoothing._gain(mine, -2.0 * mine, innovation)[1] < 0.0

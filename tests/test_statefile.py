@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.simulated import BOX_FINGERS
 from support.state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
-from test_references import adopt, broken, configured
+from test_references import adopt, configured
 
 from gripmon.judge.references import KEPT_REFERENCES, ReferenceBook
 from gripmon.judge.statefile import (
@@ -202,13 +202,6 @@ def test_a_state_of_before_messages_said_their_schema_still_counts(path: Path):
 
 def test_what_is_packed_here_is_sound_unless_changed():
     assert unpack(packed()).state == STATE
-
-
-@pytest.mark.parametrize("what", ["swapped", "missing", "twice", "parent", "restores", "short", "turned", "last"])
-def test_a_chain_that_does_not_hold_together_is_never_used(path: Path, what: str):
-    write(path, pack(OWNER, broken(what)))
-    assert read_once(path).state is None
-    assert beside(path) == ["arm.json.damaged-1"]
 
 
 def test_what_was_set_aside_is_never_overwritten(path: Path):

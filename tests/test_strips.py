@@ -89,14 +89,6 @@ def test_of_the_true_pose_and_of_a_pixel_beside_it_nothing_is_told():
         assert told_m(*lined(), way_m) is None
 
 
-@pytest.mark.parametrize(("gain", "offset_dn"), [(0.4, 60.0), (1.8, 0.0)])
-def test_light_changes_nothing(gain: float, offset_dn: float):
-    simulation, strips, image = lined()
-    lit = np.clip(gain * image.astype(float) + offset_dn, 0.0, 255.0).astype(np.uint8)
-    assert told_m(simulation, strips, lit, 0.0) is None
-    assert told_m(simulation, strips, lit, 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
-
-
 def test_a_pose_at_which_nothing_of_them_shows_is_forgotten():
     """They aren't followed from there: afterwards they are seen in their place as before."""
     simulation, strips, image = lined()
@@ -116,12 +108,6 @@ def test_they_move_with_the_jaws():
     seen = simulation, taught(simulation), simulation.render(LAST)
     assert told_m(*seen, 0.0) is None
     assert told_m(*seen, -3.3e-3) == pytest.approx(3.3e-3, abs=3e-4)
-
-
-def test_colour_is_read_as_grey():
-    simulation, strips, image = lined()
-    grey = image if image.ndim == 2 else image[..., 0]
-    assert told_m(simulation, strips, np.repeat(grey[..., None], 3, axis=2), 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
 
 
 @pytest.mark.parametrize("way_m", [0.0, *SLIDES_M])

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from support.meters import box_gripper, moved
 from support.simulated import nominal_cam_T_grip
-from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
+from support.taught_scenes import CAMERA, OPENING_M, arrays, image_of, measured, taught_from
 
 from gripmon.model.geometry import invert
-from gripmon.simulate.solids import finger_solids
-from gripmon.teach.lines import EdgePoints, find_line, pool, settle_line, slopes
+from gripmon.teach.lines import pool
 from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.settings import SamplingSettings
-from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges
 
 POSE = nominal_cam_T_grip()
 GRIPPER = box_gripper()
@@ -31,13 +30,6 @@ def predicted(edges: dict[str, TaughtEdge] | None, pose: np.ndarray, opening_m: 
     taught = None if edges is None else TaughtEdges.of(edges, GRIPPER, POSE, OPENING_M)
     layout = lay_out(CAMERA, GRIPPER, pose, opening_m, SamplingSettings(), taught)
     return predict(CAMERA, GRIPPER, layout, pose, opening_m, OFFSETS_PX, True, taught)
-
-
-def shifts_px(found: Prediction, plain: Prediction, edge: int = EDGE) -> np.ndarray:
-    """(k,) how far an edge's samples lie from those of another prediction, along its normals."""
-    assert found.layout.edge.tolist() == plain.layout.edge.tolist()
-    mine = found.layout.edge == edge
-    return np.einsum("ni,ni->n", found.uv_px - plain.uv_px, plain.normal)[mine]
 
 
 @pytest.mark.parametrize("turn_rad", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.2), (-0.02, 0.05, -0.1)])
@@ -61,15 +53,6 @@ def test_samples_lie_where_the_shifted_edge_projects(turn_rad: tuple[float, floa
     assert np.abs(np.einsum("ni,ni->n", found.uv_px[mine] - plain, found.normal[mine])).min() > 0.7
 
 
-def test_an_offset_to_the_right_is_to_the_right_in_the_image():
-    found = predicted({"L_tip_near": taught_edge()}, POSE)
-    plain = predicted({"L_tip_near": taught_edge(offset_m=(0.0, 0.0))}, POSE)
-    mine = plain.layout.edge == EDGE
-    along = plain.uv_px[mine][-1] - plain.uv_px[mine][0]
-    shift = (found.uv_px - plain.uv_px)[mine].mean(axis=0)
-    assert along[0] * shift[1] - along[1] * shift[0] > 0.0, "y points down: right of walking along x"
-
-
 def test_what_is_measured_from_a_taught_line_is_the_models_own_motion():
     """Jacobian, lines and corners are the sharp model's, whatever was taught."""
     edges = {name: taught_edge() for name in ("L_tip_near", "L_tip_in", "R_tip_near")}
@@ -79,19 +62,6 @@ def test_what_is_measured_from_a_taught_line_is_the_models_own_motion():
     np.testing.assert_array_equal(found.line_origin, plain.line_origin)
     np.testing.assert_array_equal(found.corners.uv_px, plain.corners.uv_px)
     assert np.abs(found.uv_px - plain.uv_px).max() > 0.5
-
-
-def test_an_offset_in_metres_grows_in_the_image_as_the_gripper_comes_nearer():
-    near = moved(POSE, np.array([0.0, 0.0, -0.04, 0.0, 0.0, 0.0]))
-    shifts = []
-    for pose in (POSE, near):
-        found = predicted({"L_tip_near": taught_edge(offset_m=(1e-4, 1e-4))}, pose)
-        plain = predicted({"L_tip_near": taught_edge(offset_m=(0.0, 0.0))}, pose)
-        shifts.append(shifts_px(found, plain).mean())
-    depth_m = (GRIPPER.points_grip_m(OPENING_M)[GRIPPER.edge_points[EDGE]].mean(axis=0) @ POSE[:3, :3].T + POSE[:3, 3])[
-        2
-    ]
-    assert shifts[1] / shifts[0] == pytest.approx(depth_m / (depth_m - 0.04), rel=0.03)
 
 
 def test_taught_creases_and_shifts_are_used_while_they_show_as_taught():
@@ -148,45 +118,11 @@ def test_taught_polarity_fills_in_where_the_gripper_file_says_any():
     assert good.consensus.edge_seen[crease] and not bad.consensus.edge_seen[crease]
 
 
-def test_slopes_are_those_of_a_cut_edge():
-    """The depth of the rims of the renderer's bevelled solid for each metre that they lie to the side."""
-    width_m = 4e-4
-    points = GRIPPER.points_grip_m(OPENING_M)
-    axes = sight_axes(GRIPPER, points, POSE)
-    crease = GRIPPER.edge_view(points, invert(POSE)[:3, 3]).crease
-    solids, eye = finger_solids(bevelled(width_m)), invert(POSE)[:3, 3]
-    checked = 0
-    for edge in np.flatnonzero(GRIPPER.edge_view(points, eye).visible):
-        start, end = points[GRIPPER.edge_points[edge]]
-        along = (end - start) / np.linalg.norm(end - start)
-        vertices = solids[GRIPPER.edge_finger[edge]].vertices_m
-        beside = vertices[np.linalg.norm(np.cross(vertices - start, along), axis=1) < 1.5 * width_m]
-        across, depth = (beside - eye) @ axes[0][edge], (beside - start) @ axes[1][edge]
-        rim = int(np.argmin(np.abs(across)))
-        if crease[edge] or abs(depth[rim] / across[rim]) > 4.9:
-            continue
-        offset_m = np.zeros(len(GRIPPER.edge_ids))
-        offset_m[edge] = across[rim]
-        assert slopes(GRIPPER, points, crease, axes, offset_m)[edge] == pytest.approx(depth[rim] / across[rim], rel=0.1)
-        assert np.isnan(slopes(GRIPPER, points, crease, axes, -offset_m)[edge]), "no bevel lies outside"
-        checked += 1
-    assert checked >= 4
-
-
 # --- all edges together ---
 
 NOISE_M2 = np.tile((5e-6) ** 2 * np.eye(2), (12, 1, 1))
 ROWS = np.random.default_rng(0).normal(size=(12, 2, 3))
 KIND = np.zeros(12, dtype=np.intp)
-
-
-def test_noise_of_sharp_edges_is_taken_back():
-    rng, rms = np.random.default_rng(1), []
-    for _ in range(20):
-        ends_m = rng.normal(0.0, 5e-6, (12, 2)) + ROWS @ np.array([1e-4, -5e-5, 2e-5])
-        pooled = pool(ends_m, NOISE_M2, ROWS, KIND, np.eye(3) * 1e-2**2)
-        rms.append(np.sqrt(np.mean(np.square(pooled.ends_m - ROWS @ np.array([1e-4, -5e-5, 2e-5])))))
-    assert np.mean(rms) < 0.65 * 5e-6
 
 
 def test_what_edges_have_of_their_own_is_kept():
@@ -211,40 +147,3 @@ def test_the_claimed_covariance_is_that_of_the_errors(own_m: float):
 
 
 # --- one edge's line ---
-
-
-def points_on(lines: list[tuple[float, float, float]], rng: np.random.Generator, profiles: int = 60) -> EdgePoints:
-    """Edge points of one image: a stray in every profile, and lines (offset at both ends, part of the profiles)."""
-    way = np.linspace(0.0, 1.0, profiles)
-    parts = [(way, rng.uniform(-4.5, 4.5, profiles), np.arange(profiles))]
-    for start_px, end_px, share in lines:
-        shown = rng.random(profiles) < share
-        offset_px = start_px + (end_px - start_px) * way + rng.normal(0.0, 0.05, profiles)
-        parts.append((way[shown], offset_px[shown], np.arange(profiles)[shown]))
-    way, offset_px, profile = (np.concatenate(part) for part in zip(*parts, strict=True))
-    none = np.zeros(len(way), dtype=np.intp)
-    return EdgePoints(way, offset_px, np.ones(len(way)), profile, none, np.array([profiles]))
-
-
-def test_a_line_is_found_among_strays_wherever_it_lies():
-    rng = np.random.default_rng(4)
-    for start_px, end_px in ((0.0, 0.0), (2.3, 1.9), (-3.4, -3.9)):
-        line = find_line(points_on([(start_px, end_px, 0.9)], rng), np.zeros(2), 4.0)
-        assert line is not None and line.rival_px is None
-        np.testing.assert_allclose(line.ends_px, [start_px, end_px], atol=0.08)
-        assert 0.85 < line.seen < 1.0 and line.rms_px < 0.15
-
-
-def test_of_two_lines_the_expected_one_is_taken_and_the_other_named():
-    points = points_on([(0.3, 0.2, 0.9), (3.2, 3.1, 0.95)], np.random.default_rng(5))
-    near, far = find_line(points, np.zeros(2), 4.0), find_line(points, np.full(2, 3.0), 4.0)
-    assert near is not None and far is not None
-    np.testing.assert_allclose(near.ends_px, [0.3, 0.2], atol=0.08)
-    np.testing.assert_allclose(far.ends_px, [3.2, 3.1], atol=0.08)
-    assert near.rival_px == pytest.approx(2.9, abs=0.5) and far.rival_px == pytest.approx(-2.9, abs=0.5)
-
-
-def test_too_few_points_are_no_line():
-    rng = np.random.default_rng(6)
-    assert find_line(points_on([], rng, profiles=4), np.zeros(2), 4.0) is None
-    assert settle_line(points_on([(3.0, 3.0, 1.0)], rng), np.full(2, -40.0)) is None

@@ -22,7 +22,7 @@ from support.simulated import BOX_FINGERS, box_model, nominal_cam_T_grip
 from support.taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.cli import main
-from gripmon.daemon.config import ConfigError, builtin_config, load_config, read_gripper
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.geometry import to_record
@@ -30,7 +30,7 @@ from gripmon.simulate.scenario import Sensor
 from gripmon.teach.api import to_yaml
 from gripmon.teach.drawing import Labels
 from gripmon.track.edges import TaughtModel
-from gripmon.track.edges.taught import TaughtEdge, gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4
@@ -313,12 +313,8 @@ def test_a_gripper_without_a_jaw_takes_no_opening(tmp_path: Path, capsys: pytest
     ("changes", "said"),
     [
         ({"camera__fx_px": 962.5}, "camera.fx_px: taught with 962.0, the configuration has 962.5; teach again"),
-        ({"camera__fy_px": 961.0}, "camera.fy_px: taught with 962.0"),
-        ({"camera__cx_px": 383.0}, "camera.cx_px: taught with 383.5"),
-        ({"camera__cy_px": 288.0}, "camera.cy_px: taught with 287.5"),
         ({"camera__kappa_per_px2": 2e-7}, "camera.kappa_per_px2: taught with 1.9e-07"),
         ({"camera__width_px": 800}, "camera.width_px: taught with 768, the configuration has 800"),
-        ({"camera__height_px": 600}, "camera.height_px: taught with 576"),
         ({"reference__cam_T_grip__translation_m": [0.0005, 0.0013, 0.115]}, "reference.cam_T_grip: taught at demo-"),
         ({"monitor__corners": {"edges": {"blur_px": 1.0}}}, "edge_settings.blur_px: taught with 0.65"),
         ({"gripper": "other.yaml"}, "gripper: taught with two_box_fingers with other contents"),
@@ -337,14 +333,6 @@ def test_another_camera_gripper_or_reference_is_refused(
     assert line.endswith("teach again (gripmon teach), or use what it was taught with")
     assert "taught" in fault(["replay", rig / "moved", "--config", path, "--out", rig / "x.jsonl"], capsys)
     assert load_config(path, with_taught=False).taught is None, "to teach again it is not in the way"
-
-
-def test_another_lens_is_refused(rig: Path, taught: Path):
-    lens = yaml.safe_load((rig / "config.yaml").read_text())["camera"]
-    lens.pop("kappa_per_px2")
-    path = changed(rig / "config.yaml", rig / "lens.yaml", camera={**lens, "model": "brown_conrady"})
-    with pytest.raises(ConfigError, match=r"camera\.model: taught with paper, the configuration has brown_conrady"):
-        load_config(path)
 
 
 def test_comments_order_and_spelling_of_the_gripper_file_do_not_matter(rig: Path, taught: Path):
@@ -431,12 +419,6 @@ def test_reading_gives_back_what_was_written(tmp_path_factory: pytest.TempPathFa
     path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
     path.write_text(to_yaml(model), encoding="utf-8")
     assert to_settings(read_yaml(path), TaughtModel) == model
-
-
-def test_the_gripper_files_digest_is_that_of_its_content():
-    one, two = read_gripper(BOX_FINGERS), read_gripper(BOX_FINGERS)
-    assert gripper_digest(one) == gripper_digest(two) and len(gripper_digest(one)) == 64
-    assert TaughtEdge.__struct_config__.forbid_unknown_fields
 
 
 def test_labels_in_the_picture_do_not_lie_over_each_other_nor_leave_it():

@@ -179,58 +179,6 @@ def test_a_live_camera_and_two_pages(rig: Rig, driver: Any, tmp_path: Path):
     assert (tmp_path / "teaching" / "live-000.png").is_file()
 
 
-@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
-def test_a_configuration_that_is_there_gets_its_line(rig: Rig, driver: Any, tmp_path: Path):
-    given = yaml.safe_load((rig.folder / "sim" / "config.yaml").read_text())
-    given["gripper"] = str(rig.folder / "gripper.yaml")
-    given["source"]["path"] = str(rig.folder / "sim")
-    (tmp_path / "mine.yaml").write_text("# my own words\n" + yaml.safe_dump(given))
-    with page(rig.image_path, "--config", tmp_path / "mine.yaml") as running:
-        visitor = Visitor(driver, running.url)
-        # The reference is known: nothing has to be dragged.
-        visitor.wait(lambda: "corners measured" in visitor.text("#status"), "edges")
-        assert visitor.state("L_in_near") == "unplaced" and off_px(visitor, rig, "L_in_near") < SNAPPED_PX
-        visitor.click("#save")
-        visitor.wait(lambda: "mine.yaml is there already" in visitor.text("#saved"), "the question")
-        assert not (tmp_path / "taught.yaml").exists()
-        visitor.click("#save")
-        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files")
-        assert visitor.complaints() == []
-        visitor.click("#done")
-        assert running.ended() == (0, "")
-    assert (tmp_path / "mine.yaml").read_text().startswith("# my own words\n")
-    assert load_config(tmp_path / "mine.yaml").taught is not None
-
-
-@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
-def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
-    """How they become a gripper is tested with the whole way."""
-    with page(rig.image_path, "--camera", rig.options[1], "--out", tmp_path) as running:
-        visitor = Visitor(driver, running.url)
-        assert "4 of the 4 inner corners to go" in visitor.text("#status")
-        assert "corners don't snap" in visitor.text("#status") and visitor.text("#save") == "Save corners"
-        assert visitor.find("#save").get_attribute("disabled")
-        # One thing at a time: the inner corners, and then what belongs to one that was put.
-        handles = "return [...document.querySelectorAll('.handle:not([visibility])')].map((g) => g.dataset.corner)"
-        inner = [f"{side}_inner_{end}" for side in ("left", "right") for end in ("near", "far")]
-        assert sorted(visitor.script(handles)) == sorted(inner)
-        u, v = rig.rough("L_in_near")["L_in_near"]
-        visitor.drag("left_inner_near", u, v)
-        beside = [f"left_{which}_near" for which in ("outer", "end", "rise")]
-        assert sorted(visitor.script(handles)) == sorted([*inner, *beside])
-        assert visitor.at("left_inner_near") == pytest.approx((u, v), abs=2.0)  # whole pixels of the screen
-        assert "3 of the 4 inner corners to go" in visitor.text("#status")
-        visitor.keys("z", control=True)
-        assert visitor.state("left_inner_near") == "idle"
-        visitor.keys("y", control=True)
-        assert visitor.state("left_inner_near") == "put" and visitor.state("left_outer_near") == "idle"
-        visitor.click("#save")
-        visitor.wait(lambda: "left_inner_far: is missing" in visitor.text("#saved"), "what is missing")
-        assert not list(tmp_path.iterdir()) and visitor.complaints() == []
-        visitor.click("#done")
-        assert running.ended() == (0, "")
-
-
 def test_an_interrupt_leaves_nothing_running(rig: Rig, tmp_path: Path):
     with page(rig.image_path, *rig.options, "--out", tmp_path) as running:
         port = urllib.parse.urlsplit(running.url).port

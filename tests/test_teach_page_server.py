@@ -220,7 +220,7 @@ def test_a_request_must_be_json_and_short(served: PageServer):
     assert ask(served, "state")[0] == 200
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     corners=st.dictionaries(
         st.sampled_from(["L_in_near", "L_in_far", "L_out_near", "R_in_near", "R_in_far", "R_out_far"]),

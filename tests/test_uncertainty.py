@@ -63,28 +63,3 @@ def test_errors_have_the_spread_of_the_claimed_covariance(noise: Noise, assumed_
     found = nees(noise, assumed_px, edge_spread_px)
     assert 4.0 < np.mean(found) < 7.5
     assert np.mean(found < 22.46) >= 0.98, "of which 99.9 % should lie inside"
-
-
-def test_what_a_line_is_worth_is_the_scatter_of_its_edge():
-    """Variance of the mean of an edge's points: what its stretches share, over their number, and their own."""
-    rng = np.random.default_rng(3)
-    means, claimed = [], []
-    edge = int(EDGE[len(EDGE) // 2])
-    mine = edge == EDGE
-    for _ in range(200):
-        noise = neighbours_together(rng)
-        edgels = votes_for(candidates(np.arange(SAMPLES), PREDICTION.jacobian @ NO_JAW + noise, 0.1), NO_FLOORS)
-        uncertainty = assess(edgels, fit_irls(edgels, REPORTED, np.zeros(7), NO_FLOORS), PRIOR)
-        weight = uncertainty.line_weight[mine]
-        means.append(np.average(noise[mine], weights=weight))
-        claimed.append(1.0 / weight.sum())
-    # An edge has few stretches, which share what all edges together scatter.
-    assert 0.8 < np.mean(claimed) / np.var(means) < 1.8
-
-
-def test_without_inliers_the_prior_alone_is_claimed():
-    edgels = votes_for(candidates(np.arange(0), np.zeros(0)))
-    consensus = fit_irls(edgels, REPORTED, np.zeros(7), NO_FLOORS)
-    uncertainty = assess(edgels, consensus, PRIOR)
-    assert np.diag(uncertainty.covariance) == pytest.approx(1.0 / PRIOR)
-    assert uncertainty.shared_px == 0.0 and len(uncertainty.line_weight) == 0

@@ -49,16 +49,6 @@ def test_three_lie_on_two_fingers_and_never_on_a_line():
         assert np.linalg.svd(points[taken] - points[taken].mean(axis=0), compute_uv=False)[1] > 4e-3
 
 
-def test_a_hidden_corner_is_replaced_by_the_next_one_of_its_finger():
-    gripper = read_gripper(BOX_FINGERS)
-    [instead] = names(gripper, 4, ("L_in_far",)) - {"L_in_near", "R_in_near", "R_in_far"}
-    assert instead.startswith("L_out_")
-    left = tuple(name for name in gripper.corner_ids if name.startswith("L"))
-    assert names(gripper, 4, left) == {name for name in gripper.corner_ids if name.startswith("R")}
-    assert names(gripper, 5, left) == names(gripper, 4, left), "there are no more"
-    assert names(gripper, 3, gripper.corner_ids) == set()
-
-
 def test_any_gripper_gives_those_nearest_to_its_tcp():
     """Fingertips whose corners lie anywhere, one finger, three fingers: by distances alone, reckoned here."""
     rng = np.random.default_rng(1)

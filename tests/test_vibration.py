@@ -50,11 +50,6 @@ def test_the_frequency_is_in_the_frames_own_time(frames_per_s: float):
     assert last.frequency_hz == pytest.approx(hertz, rel=0.01)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_is_none(seed: int):
-    assert not any(watched(noise(seed, 1000)))
-
-
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("size", [10.0, 100.0, 1000.0])
 def test_a_step_is_none(seed: int, size: float):

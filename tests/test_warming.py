@@ -17,8 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from gripmon.model import compiled
-from gripmon.model.compiled import Watched, fingerprint, locked
+from gripmon.model.compiled import Watched, locked
 from gripmon.monitor import warm_up, warming
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -145,19 +144,6 @@ def test_a_caller_is_compiled_with_a_callee_that_was_loaded(tmp_path: Path, run_
     changed = run_one(one=ONE.replace("return FACTOR", "return 1.0 + FACTOR"))
     assert "8.0 Kept" in changed and "missing __main__.times" in changed
     assert "ready other.third" in changed and "missing other.third" not in changed
-
-
-def test_the_fingerprint_is_of_what_is_named():
-    def one(x: float) -> float:
-        return x * warming.SAID_EVERY_S
-
-    def same(y: float) -> float:
-        return y + warming.SAID_EVERY_S
-
-    def another(x: float) -> float:
-        return x * compiled._INDEX_PATIENCE_S
-
-    assert fingerprint(one) == fingerprint(same) != fingerprint(another)
 
 
 @pytest.mark.parametrize("kept", [True, False])
