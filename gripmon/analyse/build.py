@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from gripmon import __version__
 from gripmon.analyse.affected import integrity_of, limits_of, motion_ranges, verdict_ranges
 from gripmon.analyse.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
-from gripmon.analyse.correction import ChangePoint, correct
+from gripmon.analyse.corrected import correct_table
+from gripmon.analyse.correction import ChangePoint
 from gripmon.analyse.events import MOTIONS, alert_event, histories_of, pauses_of, reference_changes
 from gripmon.analyse.motions import motions_of
 from gripmon.analyse.pictures import picture_seqs
@@ -28,7 +29,7 @@ from gripmon.record.recordings import Recording
 _END_FRAMES = 15
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class AnalysedRecording:
     """A recording and its report."""
 
@@ -61,7 +62,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
     points: tuple[ChangePoint, ...] = ()
     missable_m: float | None = None
     with contextlib.suppress(ValueError):  # too few frames were measured, or have a valid covariance
-        found = correct(track.stamp_ns, table.matrices(), table.covariance, track.measured)
+        found = correct_table(dataclasses.replace(table, stamp_ns=track.stamp_ns))
         points, missable_m = found.change_points, found.missable_m
     motions = motions_of(track, histories, points, limits)
     events = [*motions, *(alert_event(each) for each in histories if not each.is_motion), *pauses_of(track)]
