@@ -32,7 +32,7 @@ def block(language: str) -> str:
 def test_the_driver_in_python_is_heard():
     endpoint = free_endpoint()
     link = Link(PublishSettings(listen=(endpoint,)))
-    camera = NetworkCamera(NetworkSettings(), link, "gripmon/arm1/wrist/image", (768, 576))
+    camera = NetworkCamera(NetworkSettings(), link, "gripmon/arm1/wrist/image", (1280, 720))
     code = block("python").replace(DEFAULT_ENDPOINT, endpoint)
     assert endpoint in code
     driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
@@ -40,7 +40,7 @@ def test_the_driver_in_python_is_heard():
     try:
         wait_until(lambda: _read(camera, frames) or len(frames) >= 3 or driver.poll() is not None, "frames", WAIT_S)
         assert len(frames) >= 3, driver.communicate()
-        assert all(frame.image is not None and frame.image.shape == (576, 768) for frame in frames)
+        assert all(frame.image is not None and frame.image.shape == (720, 1280) for frame in frames)
         assert frames[0].stamp_ns < frames[1].stamp_ns < frames[2].stamp_ns
         assert camera.malformed == 0
     finally:

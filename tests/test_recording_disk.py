@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -18,6 +19,7 @@ from support.recorded import Recorded, frame, record, recorder, trace, wait_unti
 
 from gripmon.daemon.watch import DaemonSettings, Watch
 from gripmon.model.records import AlertEvent, AlertKind, Severity
+from gripmon.record.container import is_complete
 from gripmon.record.health import SILENT, SILENT_AFTER_S, Health
 from gripmon.record.write import ProcessRecorder
 
@@ -117,6 +119,22 @@ def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
     seqs = Recorded(first).seqs()
     assert seqs[:20] == list(range(20)) and seqs[-10:] == list(range(count, count + 10))
     assert len(seqs) == writer.frames_written
+
+
+def test_closing_while_the_disk_doesn_t_answer_takes_no_longer_than_allowed(freezable_disk: Path) -> None:
+    writer = recorder(freezable_disk)
+    offer_and_wait(writer, 0, 20)
+    command("fsfreeze", "--freeze", str(freezable_disk))
+    offer(writer, 20, 20)
+    closing = threading.Thread(target=writer.close, args=(1.0,))
+    closing.start()
+    closing.join(LONG_S)
+    held, told = closing.is_alive(), writer.dropped  # without a bound it takes as long as the disk stays frozen
+    command("fsfreeze", "--unfreeze", str(freezable_disk))
+    assert not held
+    (path,) = freezable_disk.glob("*.rrd")
+    wait_until(lambda: is_complete(path) or writer.failure is not None, LONG_S)
+    assert len(Recorded(path).seqs()) + told == 40, "what it was given is there after all, or was counted"
 
 
 def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: Path) -> None:

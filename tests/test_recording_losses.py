@@ -8,6 +8,7 @@ import signal
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 import yaml
 from support.gripmon_process import gripmon
@@ -25,6 +26,7 @@ from support.recorded import (
 from gripmon.daemon.config import builtin_config
 from gripmon.model.records import Alert, AlertKind, Cause, Severity
 from gripmon.model.shared_images import SharedImages
+from gripmon.record.container import is_complete
 from gripmon.record.process import Worker
 from gripmon.record.read import open_recordings
 from gripmon.record.recorder import Status
@@ -116,3 +118,29 @@ def test_a_process_that_ends_while_it_is_written_to_still_says_why(tmp_path: Pat
     assert worker.gone and worker.status.path == path, "its reports were read"
     assert worker.reap() == "the recording process ended with code -9"
     images.close()
+
+
+def test_a_process_that_has_everything_and_still_starts_is_left_to_finish(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ctrl-C in a monitor's first second: the file is complete all the same, some time after the monitor's end."""
+    writer = recorder(tmp_path)
+    for i in range(20):
+        writer.frame(frame(i, PICTURE), record(i), partial(trace, i))
+    with caplog.at_level(logging.WARNING, "gripmon.record"):
+        writer.close(0.2)
+    assert (writer.failure, writer.dropped) == (None, 0) and "incomplete" not in caplog.text
+    wait_until(lambda: any(is_complete(path) for path in tmp_path.glob("*.rrd")))
+    (path,) = tmp_path.glob("*.rrd")
+    assert Recorded(path).seqs() == list(range(20))
+
+
+def test_a_recorder_that_was_given_nothing_ends_at_once_and_says_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    writer = recorder(tmp_path)
+    wait_until(lambda: writer.process_id is not None)
+    process = writer.process_id
+    writer.close(2.0)
+    assert (writer.failure, caplog.text) == (None, "")
+    assert process is not None and not psutil.pid_exists(process) and not list(tmp_path.glob("*.rrd"))

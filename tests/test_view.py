@@ -26,6 +26,7 @@ from support.headless import needs_chromium, picture_of
 from support.loopback import WAIT_S, free_endpoint, wait_until
 from support.network_daemon import ENVIRONMENT
 
+from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.record.files import FileSeries
 from gripmon.record.live import LiveStream
@@ -215,6 +216,30 @@ def viewing(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 def ports_of(url: str) -> list[int]:
     return [int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)", urllib.parse.unquote(url))]
+
+
+def test_what_cannot_be_shown_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.rrd").write_text("no recording")
+    (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = str(other.getsockname()[1])
+        for arguments, code, said in (
+            (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run, or their"),
+            (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run, or their folder"),
+            (("text.rrd",), 2, f"{tmp_path}/text.rrd: isn't a recording; an .rrd file of gripmon's"),
+            (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
+            (("right.rrd", "--web", "--port", port), 2, f"--port {port}: is in use on 127.0.0.1; another port"),
+        ):
+            assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == code
+            (line,) = capsys.readouterr().err.splitlines()
+            assert line.startswith(said)
 
 
 def test_view_serves_the_files_on_this_machine_alone_and_leaves_nothing_running(two_files: Path, tmp_path: Path):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 from gripmon import __version__
 from gripmon.analyse.affected import integrity_of, limits_of, motion_ranges, verdict_ranges
 from gripmon.analyse.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
+from gripmon.analyse.corrected import correct_table
+from gripmon.analyse.correction import ChangePoint
 from gripmon.analyse.events import MOTIONS, alert_event, histories_of, pauses_of, reference_changes
-from gripmon.analyse.motions import change_points_of, motions_of
+from gripmon.analyse.motions import motions_of
 from gripmon.analyse.pictures import picture_seqs
 from gripmon.analyse.running import dropped_of, running_of
 from gripmon.analyse.summary import headline, missing, paragraph
@@ -26,7 +29,7 @@ from gripmon.record.recordings import Recording
 _END_FRAMES = 15
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class AnalysedRecording:
     """A recording and its report."""
 
@@ -56,8 +59,11 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
     start = None if source.configuration is None else source.configuration.start
     track = make_track(table, source.references, None if start is None else start.reference_error)
     histories = histories_of(source.alerts, track)
-    alerted_ns = [one.stamp_ns for history in histories if history.is_motion for one in history.alerts]
-    points, missable_m = change_points_of(source, track, alerted_ns, limits)
+    points: tuple[ChangePoint, ...] = ()
+    missable_m: float | None = None
+    with contextlib.suppress(ValueError):  # too few frames were measured, or have a valid covariance
+        found = correct_table(dataclasses.replace(table, stamp_ns=track.stamp_ns))
+        points, missable_m = found.change_points, found.missable_m
     motions = motions_of(track, histories, points, limits)
     events = [*motions, *(alert_event(each) for each in histories if not each.is_motion), *pauses_of(track)]
     events += reference_changes(events, source.references, track)

@@ -22,7 +22,7 @@ from gripmon.analyse.correction import SOURCES, Correction, correct, sample
 from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
 from gripmon.analyse.words import clock_time, count, millimetres
 from gripmon.model.errors import NoResultError
-from gripmon.model.records import Array, Origin
+from gripmon.model.records import Array
 from gripmon.record.recordings import Recording
 from gripmon.record.table import FrameTable
 
@@ -83,11 +83,9 @@ def name_of(recording: Recording) -> str:
     return ", ".join(path.name for path in recording.files[:3]) + (", …" if len(recording.files) > 3 else "")
 
 
-def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
+def correct_table(frames: FrameTable, step: Callable[[], None] = lambda: None) -> Correction:
     """Correct the frames of a table; ``step`` is called after each stage.  ValueError if too little was measured."""
-    held = frames.ORIGINS.index(Origin.HELD.value)
-    length = np.linalg.norm(frames.cam_T_grip[:, 3:], axis=1)
-    measured = np.isfinite(frames.cam_T_grip).all(axis=1) & (frames.source != held) & ~frames.refused & (length > 0.0)
+    measured = frames.measured
     poses = np.full((len(frames), 4, 4), np.nan)
     poses[measured] = frames.take(measured).matrices()
     return correct(frames.stamp_ns, poses, frames.covariance, measured, step)

@@ -16,11 +16,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from gripmon.analyse.affected import excess
 from gripmon.analyse.content import Displacement, Event, Limits, Moment, Onset
-from gripmon.analyse.correction import ChangePoint, correct
+from gripmon.analyse.correction import ChangePoint
 from gripmon.analyse.events import MOTIONS, AlertHistory, TimedAlert, annotation
 from gripmon.analyse.track import SECOND_NS, Track, displacement
 from gripmon.model.records import AlertKind, Array, Severity
-from gripmon.record.recordings import Recording
 
 _SIDE_FRAMES = 15  # for the median that gives a level
 _SETTLED = 0.95
@@ -30,9 +29,6 @@ _NOTICED_NS = 5 * SECOND_NS  # a step is noticed within this time
 _NEARLY_ALL, _AT_MOST = 0.8, 2.0  # a change of this part of a drift's size is that drift
 _COMPARED_FRAMES = 5  # for the median that tells whether a creep has begun
 _CLEAR, _LIKELY = 3.0, 2.0  # robust standard deviations of the axis that is farthest off
-_SHORT_FRAMES, _MOST_FRAMES = 20_000, 60_000  # searched as a whole; searched in a long recording
-_BLOCK_FRAMES = 30
-_MARGIN_NS = 20 * SECOND_NS
 _TITLES = {
     AlertKind.STEP: "The camera moved at once",
     AlertKind.CREEP: "The camera crept",
@@ -250,47 +246,3 @@ def _unreported(points: Sequence[ChangePoint], events: Sequence[Event], limits: 
             )
         )
     return out
-
-
-def change_points_of(
-    source: Recording, track: Track, alerted_ns: Sequence[int], limits: Limits
-) -> tuple[list[ChangePoint], float | None]:
-    """The change points of a recording, in order of time: of all of it or, if it is long, around alerts
-    (``alerted_ns``) and around every significant change of the level.  None where too little was measured.  And up to
-    which size (m) steps may be missing among them; None: not known.
-    """
-    table = source.frames
-    points: list[ChangePoint] = []
-    missable_m: list[float] = []
-    matrices = table.matrices()
-    for part in _parts(track, alerted_ns, limits):
-        try:
-            found = correct(track.stamp_ns[part], matrices[part], table.covariance[part], track.measured[part])
-        except ValueError:  # too few frames were measured, or have a valid covariance
-            continue
-        points += found.change_points
-        missable_m.append(found.missable_m)
-    return points, max(missable_m, default=None)
-
-
-def _parts(track: Track, alerted_ns: Sequence[int], limits: Limits) -> list[slice]:
-    """Ranges of frames that may contain change points."""
-    if len(track) <= _SHORT_FRAMES:
-        return [slice(0, len(track))]
-    measured = np.flatnonzero(track.measured)
-    frames = measured[: len(measured) // _BLOCK_FRAMES * _BLOCK_FRAMES].reshape(-1, _BLOCK_FRAMES)
-    levels = np.median(track.against_first[frames], axis=1)
-    moved = levels[2:] - levels[:-2]
-    size = np.linalg.norm(moved[:, :3], axis=1) / limits.affected_m
-    size = np.maximum(size, np.linalg.norm(moved[:, 3:], axis=1) / limits.affected_rad)
-    middles = track.stamp_ns[frames[1:-1, _BLOCK_FRAMES // 2]]
-    wanted = np.unique(np.concatenate([np.array(alerted_ns, np.int64), middles[size >= 0.5]]))
-    parts: list[slice] = []
-    for stamp_ns in wanted.tolist():
-        start, stop = track.index_at(stamp_ns - _MARGIN_NS), track.index_at(stamp_ns + _MARGIN_NS)
-        if parts and start <= parts[-1].stop:
-            start = parts.pop().start
-        parts.append(slice(start, stop))
-        if sum(part.stop - part.start for part in parts) >= _MOST_FRAMES:
-            break
-    return parts

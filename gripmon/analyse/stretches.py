@@ -126,11 +126,12 @@ class _Episode:
         policy: PolicySettings,
     ) -> None:
         self.table, self.alerts, self.reasons, self.policy = table, alerts, reasons, policy
-        self.smoothed = correct_table(dataclasses.replace(table, cam_T_grip=table.absolute), lambda: None)
+        as_measured = dataclasses.replace(table, cam_T_grip=table.absolute)
+        self.smoothed = correct_table(as_measured)
         self.change_points = sorted(self.smoothed.change_points, key=lambda point: point.index)
         self.poses, self.named = pose_matrices(table.absolute), table.matrices()
         self.bounds = np.column_stack([table.protection_m, table.protection_rad])
-        self.measured: Bools = ~table.refused & np.isfinite(table.absolute).all(axis=1)
+        self.measured: Bools = as_measured.measured
         self.valid: Bools = self.measured & (table.verdict == table.VERDICTS.index(Verdict.VALID.value))
 
     def used(self, part: slice) -> NDArray[np.intp]:

@@ -103,8 +103,7 @@ def make_track(
 ) -> Track:
     """``known_error`` (6,): the configured reference's error as estimated by the monitor, if known."""
     poses = table.matrices()
-    measured = np.isfinite(table.cam_T_grip).all(axis=1) & (table.source != table.ORIGINS.index("held"))
-    measured &= np.linalg.norm(table.cam_T_grip[:, 3:7], axis=1) > 0.0  # a quaternion of zeros turns nothing
+    measured = table.measured
     sigma = np.sqrt(np.maximum(np.diagonal(table.covariance, axis1=1, axis2=2), 0.0))
     sigma[~measured] = np.nan
     named = list(zip(table.reference.tolist(), table.revision.tolist(), strict=True))

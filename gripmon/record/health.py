@@ -4,7 +4,7 @@ from __future__ import annotations
 
 SILENT_AFTER_S = 5.0
 SILENT = f"recording pauses: its process hasn't answered for {SILENT_AFTER_S:g} s"
-_START_TAKES_S = 30.0  # its imports, on a machine that is busy
+START_TAKES_S = 30.0  # its imports, on a machine that is busy
 _LOSSES_PERIOD_S = 1.0
 _PERIODS_TO_RAISE = 3  # with losses
 _PERIODS_TO_CLEAR = 5  # without
@@ -27,7 +27,7 @@ class Health:
         count what was dropped so far.  ``explained``: the process itself says why it writes nothing, so that losses
         don't mean that it is too slow.
         """
-        if now_s - heard_s > (SILENT_AFTER_S if heard else _START_TAKES_S):
+        if now_s - heard_s > (SILENT_AFTER_S if heard else START_TAKES_S):
             self.fault = SILENT
             self._counts, self._looked_s = (frames, images), now_s
             return

@@ -22,6 +22,7 @@ from gripmon.model.errors import in_short
 from gripmon.model.own_process import OwnProcess
 from gripmon.model.priority import give_way
 from gripmon.model.shared_images import SharedImages
+from gripmon.record.health import START_TAKES_S
 from gripmon.record.recorder import Scene, Status
 
 _KILL_WAIT_S = 0.5  # a process blocked by the disk dies when the disk answers, perhaps never
@@ -92,16 +93,17 @@ class Worker:
     def finish(self, deadline: float, *, complete: bool) -> str | None:
         """Let it write everything and end; ``complete``: it was sent everything.
 
-        A complete process that is still writing at the ``deadline`` (monotonic seconds) is left running, and
-        :attr:`still_writes` is set: it needs no parent and ends on its own.  Any other is killed.  Returns why the
-        recording is incomplete, None if it is complete.
+        A complete process that still starts, or is still writing, at the ``deadline`` (monotonic seconds) is left
+        running, and :attr:`still_writes` is set: it needs no parent and ends on its own.  Any other is killed.  Returns
+        why the recording is incomplete, None if it is complete.
         """
         self._batches.close()
         while not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
             self._reports.poll(left_s)
             self.look()
         if not self.gone and complete and not self.status.hangs:
-            self.still_writes = self._reports.poll(_BEAT_WAIT_S)
+            starts = not self.heard and time.monotonic() - self.heard_s < START_TAKES_S
+            self.still_writes = starts or self._reports.poll(_BEAT_WAIT_S)
             self.look()
             self.still_writes &= not self.gone
         if not self.still_writes:

@@ -185,6 +185,12 @@ class FrameTable:
     def __len__(self) -> int:
         return len(self.seq)
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(n,) frames with a transform of their own: not refused, nor held, nor by a quaternion that turns nothing."""
+        known = np.isfinite(self.cam_T_grip).all(axis=1)
+        return ~self.refused & known & (np.linalg.norm(self.cam_T_grip[:, 3:], axis=1) > 0.0)
+
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameTable:
         """Some rows: indexes, a mask or a slice."""
         return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
