@@ -33,6 +33,23 @@ def test_means_are_those_of_the_last_frames_also_when_the_ring_has_gone_round(fr
         np.testing.assert_allclose(windows.mean_of_last(length), series[-length:].mean(axis=0), rtol=0.0, atol=1e-9)
 
 
+def test_what_is_forgotten_is_in_no_window_and_streams_forget_by_themselves():
+    series = np.random.default_rng(2).normal(size=(300, 3, 6))
+    windows, _, _ = fed(series[:200])
+    windows.keep(np.array([True, False, True]), np.array([0, 0, 10]))
+    assert windows.frames.tolist() == [0, 200, 10]
+    windows.keep(np.array([False, False, True]), 30)
+    assert windows.frames.tolist() == [0, 200, 10], "what is forgotten doesn't come back"
+    for values in series[200:]:
+        mean, _ = windows.add(values)
+    full, full_before = windows.full()
+    lengths = np.array(LENGTHS)
+    for stream, frames in enumerate((100, 300, 110)):
+        np.testing.assert_array_equal(full[:, stream], lengths <= frames)
+        np.testing.assert_array_equal(full_before[:, stream], 2 * lengths <= frames)
+    np.testing.assert_allclose(mean[6], series[-64:].mean(axis=0), atol=1e-12)
+
+
 def test_sums_stay_exact_over_days():
     """Frames of a day lose no digit that matters: a shift of half a millimetre, to a nanometre."""
     windows = Windows(1)

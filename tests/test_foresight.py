@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.drift_noise import COVARIANCE
 
 from gripmon.judge.drift import CORRELATION_FRAMES, DriftSettings, SequentialTest, foresee
+from gripmon.judge.drift.foresight import _variance_of_means
 
 SETTINGS = DriftSettings()
 
@@ -20,6 +22,13 @@ def noise(rng: np.random.Generator, frames: int, streams: int) -> np.ndarray:
         value = phi * value + np.sqrt(1.0 - phi**2) * rng.normal(size=(streams, 6))
         out[k] = value @ root.T
     return out
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 17, 100])
+def test_the_variance_of_means_is_the_double_sum(length: int):
+    phi = np.exp(-1.0 / CORRELATION_FRAMES)
+    lag = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    assert _variance_of_means(np.array([float(length)]))[0] == pytest.approx((phi**lag).mean(), rel=1e-9)
 
 
 def test_larger_steps_are_noticed_sooner_and_tiny_ones_never():

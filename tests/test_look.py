@@ -100,6 +100,21 @@ def test_a_slightly_better_pose_contradicts_nothing():
     assert agreement(15).contradicts(RISK) and not agreement(15).contradicts(RISK, 1)
 
 
+def test_one_finger_is_enough_to_contradict():
+    agree = np.array([[2, 12], [12, 12]])
+    agreement = LookAgreement(np.ones((2, 2)), agree, np.full((2, 2), 12), 4.0 * agree - 8.0)
+    assert agreement.contradicts(RISK) and not agreement.contradicts(RISK, 1)
+
+
+def test_one_pose_says_what_it_says_among_several():
+    simulation, look = ordinary()
+    truth = simulation.truth(24)
+    alone = look.compare(simulation.render(24), truth.cam_T_grip, truth.jaw_opening_m)
+    among = held_against(simulation, look)
+    assert alone.log_odds.shape == (1, 2)
+    np.testing.assert_array_equal(alone.agree[0], among.agree[0])
+
+
 @pytest.mark.parametrize(
     "settings",
     [

@@ -127,6 +127,16 @@ def test_a_gripper_out_of_view_gives_an_empty_or_a_sound_prediction(pose: np.nda
         assert prediction.map_x.size == 0 and prediction.moved_px(np.full(7, 1e-3)) == 0.0
 
 
+def test_moved_px_is_the_largest_motion_of_any_edge_point():
+    prediction = predicted()
+    shift = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    later = predicted(cam_T_grip=moved(nominal_cam_T_grip(), shift[:6]))
+    way = np.einsum("ni,ni->n", later.uv_px - prediction.uv_px, prediction.normal)
+    assert prediction.moved_px(shift) == pytest.approx(np.abs(way).max(), rel=0.02)
+    # 962 px focal length at about 115 mm
+    assert prediction.pixels_per_m == pytest.approx(962.0 / 0.115, rel=0.3)
+
+
 def test_a_gripper_without_faces_samples_all_its_edges():
     model = cube_model()
     model.pop("faces")

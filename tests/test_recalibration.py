@@ -337,6 +337,37 @@ def test_the_newest_frames_count_and_forgetting_begins_anew():
     assert isinstance(recalibrator.outcome(reference()), Refusal)
 
 
+def test_leaving_an_edge_out_moves_the_pose_as_a_fit_without_it():
+    frames = Scene().frames(20)
+    pooled = pool(frames, TRUE_T)
+    rows, values, edges = [], [], []
+    scale = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+    for frame in frames:
+        assert frame.edges is not None
+        shift = perturbation_between(frame.cam_T_grip, TRUE_T)
+        for k in range(len(frame.edges.edge)):
+            # Each stretch as a square root of its information: the same normal equations.
+            moment = scale * (frame.edges.moment[k] - frame.edges.information[k] @ shift)
+            size, axes = np.linalg.eigh(frame.edges.information[k] * np.outer(scale, scale))
+            root = np.sqrt(np.maximum(size, 0.0))[:, None] * axes.T
+            rows.append(root)
+            values.append(np.linalg.lstsq(root.T, moment, rcond=1e-9)[0])
+            edges += [int(frame.edges.edge[k])] * 6
+    matrix, right, edge = np.concatenate(rows), np.concatenate(values), np.array(edges)
+
+    def fit(kept: np.ndarray) -> np.ndarray:
+        return scale * np.linalg.lstsq(matrix[kept], right[kept], rcond=None)[0]
+
+    whole = fit(np.ones(len(edge), dtype=bool))
+    names = np.unique(edge)
+    expected = (
+        sum(np.outer(d, d) for d in (fit(edge != name) - whole for name in names)) * (len(names) - 1) / len(names)
+    )
+    np.testing.assert_allclose(
+        leave_one_out(pooled) / np.outer(scale, scale), expected / np.outer(scale, scale), rtol=1e-3
+    )
+
+
 def test_without_edges_nothing_is_sure():
     frames = [replace(f, edges=None) for f in Scene().frames(20)]
     assert np.sqrt(leave_one_out(pool(frames, TRUE_T))[0, 0]) == 1.0

@@ -75,6 +75,19 @@ def test_means_of_windows_scatter_as_those_of_an_ar_process(memory: float):
         assert share(of_mean[k]) == pytest.approx(expected, rel=0.15, abs=rest)
 
 
+def test_the_sum_over_octaves_is_the_variance_of_the_means():
+    """Haar: what is left of the mean's variance at the longest length, plus all differences over four."""
+    rng = np.random.default_rng(2)
+    scatter = learnt(3.0 * autocorrelated(rng, FRAMES, STREAMS, 0.5))
+    of_mean, of_difference = covariances(scatter, 1e-6 * claimed(STREAMS), NO_MORE)
+    for k in range(len(LENGTHS) - 1):
+        np.testing.assert_allclose(of_mean[k], of_mean[k + 1] + 0.25 * of_difference[k], rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(of_mean[-1], 0.5 * of_difference[-1], rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(scatter.of_single_frames() + 0.25 * scatter.of_differences[-1], of_mean[0], rtol=1e-4)
+    more, _ = covariances(scatter, 1e-6 * claimed(STREAMS), 5.0 * NO_MORE)
+    np.testing.assert_allclose(more, 5.0 * of_mean, rtol=1e-4)
+
+
 def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
     """Noise with a fourth of the claimed variance in three directions, and four times of it in the others."""
     rng = np.random.default_rng(3)
@@ -92,6 +105,15 @@ def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
     assert share(of_difference[long]) > 2.0 * 0.4 * 0.5, "two backgrounds have two biases"
 
 
+def test_before_anything_was_seen_means_are_worth_about_what_frames_claim():
+    scatter = Scatter(1)
+    scatter.begin(claimed(1))
+    of_mean, _ = covariances(scatter, claimed(1), NO_MORE[:, :1])
+    assert 1.0 <= share(of_mean[0]) < 2.5
+    assert (np.array([share(each) for each in of_mean]) >= 1.0).all()
+    assert (np.diff([share(each) for each in of_mean]) <= 0.0).all()
+
+
 def test_one_wild_difference_hardly_counts():
     """Beyond four times what is expected a square counts as that much."""
     calm, wild = Scatter(1), Scatter(1)
@@ -101,3 +123,47 @@ def test_one_wild_difference_hardly_counts():
         normalised = np.full((len(LENGTHS), 1), 6.0 * size**2)
         scatter.learn(difference, normalised, np.full((len(LENGTHS), 1), True), 4)
     assert share(wild.of_differences) < share(calm.of_differences) + 4.0 / 13.0
+
+
+def test_what_is_not_usable_is_not_learnt():
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    before, windows = scatter.of_differences.copy(), scatter.windows.copy()
+    usable = np.tile([True, False], (len(LENGTHS), 1))
+    scatter.learn(np.ones((len(LENGTHS), 2, 6)), np.ones((len(LENGTHS), 2)), usable, 4)
+    np.testing.assert_array_equal(scatter.of_differences[:, 1], before[:, 1])
+    np.testing.assert_array_equal(scatter.windows[:, 1], windows[:, 1])
+    assert (scatter.of_differences[:, 0] != before[:, 0]).all()
+
+
+def what_is_missing(shown: np.ndarray) -> np.ndarray:
+    """The part of the claimed covariance, direction by direction, that exceeds what was shown (..., 6, 6)."""
+    root = np.linalg.cholesky(COVARIANCE)
+    inverse = np.linalg.inv(root)
+    shares, directions = np.linalg.eigh(inverse @ shown @ inverse.T)
+    towards = root @ directions
+    return np.asarray((towards * np.maximum(1.0 - shares, 0.0)[..., None, :]) @ np.swapaxes(towards, -1, -2))
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3, 1.0, 3.0])
+def test_what_is_missing_of_the_claim_comes_on_top_direction_by_direction(seen: float):
+    """Less than claimed in some directions, more in others; against eigenvalues, at every length."""
+    rng = np.random.default_rng(5)
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    mix = np.eye(6) + 0.2 * rng.normal(size=(len(LENGTHS), 2, 6, 6))
+    scatter.of_differences[:] = seen * mix @ COVARIANCE @ mix.swapaxes(-1, -2) + 1e-3 * COVARIANCE
+    scatter.windows[:] = rng.uniform(12.0, 200.0, scatter.windows.shape)
+    inflation = rng.uniform(1.0, 3.0, (len(LENGTHS), 2))
+    parts = 0.25 * scatter.of_differences
+    parts[-1] *= 2.0  # beyond the longest, windows count as independent
+    total, shown = (
+        np.flip(np.cumsum(np.flip(times[..., None, None] * parts, axis=0), axis=0), axis=0)
+        for times in (inflation, scatter.learnt)
+    )
+    rarely = np.concatenate([shown, np.zeros_like(shown[:1])])[RARE]
+    differences = inflation[..., None, None] * scatter.of_differences + 2.0 * what_is_missing(shown[:1] - rarely)
+    for found, expected in zip(
+        covariances(scatter, claimed(2), inflation), (total + what_is_missing(shown[:1]), differences), strict=True
+    ):
+        assert (np.abs(found - expected) <= 1e-7 * np.abs(expected).max(axis=(-2, -1), keepdims=True)).all()

@@ -95,6 +95,21 @@ def test_noise_louder_than_frames_claim_is_learnt(streams: int):
     assert 0.3 * 9.0 < np.trace(usual) / 6.0 < 3.0 * 9.0
 
 
+def test_what_is_usual_is_what_frames_claim_and_the_stream_has_shown_together():
+    """Their sum, with the claims as they are, and followed within some hundred frames where they change."""
+    test, scaled = SequentialTest(PLAIN), SequentialTest(PLAIN)
+    for _ in range(600):
+        test.add(np.zeros((1, 6)), claimed(1))
+        scaled.add(np.zeros((1, 6)), 4.0 * claimed(1))
+    shown = test.scatter.of_single_frames()[0]
+    np.testing.assert_allclose(test.usual_covariance(), COVARIANCE + shown, rtol=1e-6)
+    np.testing.assert_allclose(scaled.usual_covariance() - scaled.scatter.of_single_frames()[0], 4.0 * COVARIANCE)
+    for _ in range(1000):
+        test.add(np.zeros((1, 6)), 9.0 * claimed(1))
+    claims = test.usual_covariance() - test.scatter.of_single_frames()[0]
+    np.testing.assert_allclose(claims, 9.0 * COVARIANCE, rtol=1e-3)
+
+
 def bursting(rng: np.random.Generator, frames: int, streams: int) -> np.ndarray:
     """Normal errors whose size wanders by half of itself, as long as half a second at 60 frames/s."""
     log, memory = np.empty((frames, streams)), np.exp(-1.0 / 32.0)

@@ -12,18 +12,19 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sh
 from support.watched import frames_of, new_monitor, reference_of, watched
 
 from gripmon.belief.doubts import Told, log_told
-from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, Seen
+from gripmon.belief.state import FOCAL, LENGTHS, LIGHT, MOTION, REFERENCE, SIZE, Seen
 from gripmon.model.camera import make_camera
 from gripmon.model.poses import perturb
 from gripmon.model.records import Frame
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.monitor.edge_lines import lines_of
+from gripmon.monitor.edge_lines import Frame2d, Line, Parts, lines_of, merged
 from gripmon.monitor.ends_told import EndsTold
 from gripmon.monitor.lighting import Lighting
-from gripmon.monitor.shadow import Look, Shadow
+from gripmon.monitor.shadow import Look, Shadow, _alike, _texture
 from gripmon.simulate import paper_rig
 from gripmon.simulate.scenario import Scenario
 from gripmon.track.edges import FingerEndsSeen
+from gripmon.track.edges.prediction import EdgeLayout
 
 FRAME_S = 1.0 / 30.0
 
@@ -110,6 +111,16 @@ def test_only_ends_tell_of_lengths() -> None:
         assert not lengths[~tips | (finger != f), f].any()
 
 
+def test_pictures_are_alike_but_for_gain_and_noise() -> None:
+    rng = np.random.default_rng(4)
+    picture, other = rng.normal(120.0, 8.0, (2, 12))
+    for gain, offset in ((1.0, 0.0), (0.8, 15.0)):
+        again = gain * picture + offset + rng.normal(0.0, 0.5, 12)
+        assert _alike(again, picture, 0.5) == 0.999
+    assert _alike(other, picture, 0.5) < 0.8
+    assert _alike(picture + rng.normal(0.0, 4.0, 12), picture, 0.5) <= 0.98
+
+
 def test_a_background_that_creeps_is_another_one_in_the_end() -> None:
     """0.2 of a place a frame: no two frames differ by more than their noise, the first and the tenth do."""
     rng = np.random.default_rng(4)
@@ -165,6 +176,15 @@ def test_the_light_is_looked_at_on_the_fingers_and_the_belief_is_told() -> None:
     assert unsure[1] > 2.0 * unsure[0] and unsure[2] == pytest.approx(unsure[0], rel=0.2)
 
 
+def test_texture_is_the_scatter_without_noise_and_shading() -> None:
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(400):
+        side = 100.0 + np.linspace(0.0, 20.0, 12) + rng.normal(0.0, 3.0, 12) + rng.normal(0.0, 1.0, 12)
+        found.append(_texture(side[None, None].repeat(2, axis=1), 0, 1.0) ** 2)
+    assert np.mean(found) == pytest.approx(9.0, rel=0.1)
+
+
 def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None:
     """Twenty search lines: the fit's line, another 4 px beside and oblique, a third that too few show, and noise."""
     rng, fraction = np.random.default_rng(6), np.linspace(0.1, 0.9, 20)
@@ -183,6 +203,38 @@ def test_lines_are_those_of_the_fit_and_what_half_of_the_rest_supports() -> None
     assert len(lines_of(offset, sample, fraction[sample], np.zeros(len(of), bool), 20)) == 2
     noise = of == 3
     assert lines_of(offset[noise], sample[noise], fraction[sample[noise]], np.zeros(noise.sum(), bool), 20) == []
+
+
+def test_a_line_that_stands_still_is_the_same_line_whatever_is_seen_of_it() -> None:
+    """Two parts of one line, in the frame of the edge that was seen there first."""
+    frame = Frame2d(np.array([100.0, 50.0]), np.array([20.0, 0.0]))
+    for first, last in ((80.0, 120.0), (115.0, 160.0)):
+        x = np.linspace(first, last, 12)
+        place, variance = frame.line(np.column_stack([x, 52.0 + 0.1 * (x - 100.0)]), np.ones(12))
+        assert place == pytest.approx([2.0, 2.0], abs=1e-9)
+        basis = np.column_stack([np.ones(12), (x - 100.0) / 20.0])
+        assert variance == pytest.approx(np.diag(np.linalg.inv(basis.T @ basis)))
+
+
+def test_a_curve_is_several_edges_of_the_belief() -> None:
+    """A straight border touches an arc in a part of it: in another the slopes differ."""
+    parts = Parts(np.array([False, True]))
+    assert len(parts) == 3 and parts.edge.tolist() == [0, 1, 1]
+    edge, fraction = np.repeat([0, 1], 4), np.tile([0.0, 0.4, 0.6, 1.0], 2)
+    two = np.ones(2, bool)
+    layout = EdgeLayout(edge, fraction, np.array([0, 1]), np.array([0, 4]), two, ~two)
+    assert parts.of(layout).tolist() == [0, 0, 0, 0, 1, 1, 2, 2]
+
+
+def test_a_line_of_two_looks_is_one_and_the_fits_own_is_named() -> None:
+    def line(place_px: float, agrees: bool) -> Line:
+        two = np.zeros(2)
+        return Line(np.zeros((2, SIZE)), np.array([place_px, 0.0]), two, two, two, two, 10.0, 50.0, agrees)
+
+    looks = [[line(0.1, True), line(4.0, False)], [line(4.2, True), line(-20.0, False)]]
+    assert [of.place_px[0] for of in merged(looks, 1)[0]] == [0.1, 4.0, -20.0]
+    assert [merged(looks, by)[1] for by in (0, 1)] == [0, 1]
+    assert merged([[], [line(1.0, False)]], 0)[1] == -1
 
 
 def test_the_gripper_is_looked_for_where_it_is_believed_to_be_though_the_fit_slid_away() -> None:

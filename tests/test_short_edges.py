@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 from support.meters import box_gripper, measure, meter
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 from support.watched import pose_of, reference_of, watch
@@ -16,9 +17,11 @@ from gripmon.model.records import Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import FingerLook, FingerMark, ObjectLook, Prop
-from gripmon.track.edges.prediction import BORDER_PX, lay_out
+from gripmon.track.edges import prediction_kernel
+from gripmon.track.edges.prediction import BORDER_PX, ROWS, independent_part, lay_out
+from gripmon.track.edges.profiles import find_candidates, profile_offsets_px, read_profiles
 from gripmon.track.edges.roles import along_fingers
-from gripmon.track.edges.settings import SamplingSettings
+from gripmon.track.edges.settings import EdgeSettings, SamplingSettings
 from gripmon.track.look import FingerStrips
 from gripmon.track.look.strips import FIRST_FRAMES
 
@@ -87,6 +90,34 @@ def test_an_edge_that_the_border_cuts_is_sampled_up_to_it(turn_rad: float):
                 assert left_px < 0.1
                 cut += 1
     assert cut >= 3
+
+
+@pytest.mark.parametrize(("length_px", "count"), [(4.0, 5), (8.0, 9), (16.0, 6)])
+def test_the_mean_of_profiles_that_share_pixels_scatters_as_if_they_were_fewer(length_px: float, count: int):
+    """Noise of 4 grey levels on a step of 40; without noise they would all be the same."""
+    rng = np.random.default_rng(3)
+    offsets_px, noise_dn = profile_offsets_px(7.0), 4.0
+    v, u = np.mgrid[0:48, 0:48].astype(float)
+    means, singles = [], []
+    for _ in range(700):
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        normal, middle = np.array([np.cos(angle), np.sin(angle)]), 23.5 + rng.uniform(-0.5, 0.5, 2)
+        away_px = (u - middle[0]) * normal[0] + (v - middle[1]) * normal[1]
+        image = (80.0 + 40.0 * ndtr(away_px / 0.6) + rng.normal(0.0, noise_dn, u.shape)).astype(np.float32) / 255.0
+        along_px = np.linspace(-0.5 * length_px, 0.5 * length_px, count)
+        uv_px = middle + along_px[:, None] * np.array([normal[1], -normal[0]])
+        rows_px = np.arange(-1, 2).astype(np.float32)
+        assert len(rows_px) == ROWS
+        maps = prediction_kernel.maps(uv_px, np.tile(normal, (count, 1)), offsets_px.astype(np.float32), rows_px)
+        profiles, noise = read_profiles(image, *maps), noise_dn / 255.0 / np.sqrt(ROWS)
+        found = find_candidates(profiles, np.ones(count, dtype=bool), noise, 1.0, EdgeSettings())
+        near = np.abs(found.offset_px) < 0.8
+        if (np.bincount(found.sample[near], minlength=count) == 1).all():
+            means.append(found.offset_px[near].mean())
+            singles.append(found.offset_px[near])
+    assert len(means) > 450
+    part = independent_part(uv_px, np.zeros(count, dtype=np.intp), 1, float(ROWS))[0]
+    assert np.var(means) / np.var(singles) == pytest.approx(1.0 / (part * count), rel=0.2)
 
 
 # --- a monitor ---

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from support.meters import box_gripper, moved
 from support.simulated import nominal_cam_T_grip
-from support.taught_scenes import CAMERA, OPENING_M, arrays, image_of, measured, taught_from
+from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
 
 from gripmon.model.geometry import invert
-from gripmon.teach.lines import pool
+from gripmon.simulate.solids import finger_solids
+from gripmon.teach.lines import pool, slopes
 from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.settings import SamplingSettings
-from gripmon.track.edges.taught import TaughtEdge, TaughtEdges
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
 POSE = nominal_cam_T_grip()
 GRIPPER = box_gripper()
@@ -116,6 +117,31 @@ def test_taught_polarity_fills_in_where_the_gripper_file_says_any():
     bad = measured(image, TaughtEdges.of(edges, GRIPPER, POSE, OPENING_M), POSE)
     crease = GRIPPER.edge_ids.index("L_in_near_along")
     assert good.consensus.edge_seen[crease] and not bad.consensus.edge_seen[crease]
+
+
+def test_slopes_are_those_of_a_cut_edge():
+    """The depth of the rims of the renderer's bevelled solid for each metre that they lie to the side."""
+    width_m = 4e-4
+    points = GRIPPER.points_grip_m(OPENING_M)
+    axes = sight_axes(GRIPPER, points, POSE)
+    crease = GRIPPER.edge_view(points, invert(POSE)[:3, 3]).crease
+    solids, eye = finger_solids(bevelled(width_m)), invert(POSE)[:3, 3]
+    checked = 0
+    for edge in np.flatnonzero(GRIPPER.edge_view(points, eye).visible):
+        start, end = points[GRIPPER.edge_points[edge]]
+        along = (end - start) / np.linalg.norm(end - start)
+        vertices = solids[GRIPPER.edge_finger[edge]].vertices_m
+        beside = vertices[np.linalg.norm(np.cross(vertices - start, along), axis=1) < 1.5 * width_m]
+        across, depth = (beside - eye) @ axes[0][edge], (beside - start) @ axes[1][edge]
+        rim = int(np.argmin(np.abs(across)))
+        if crease[edge] or abs(depth[rim] / across[rim]) > 4.9:
+            continue
+        offset_m = np.zeros(len(GRIPPER.edge_ids))
+        offset_m[edge] = across[rim]
+        assert slopes(GRIPPER, points, crease, axes, offset_m)[edge] == pytest.approx(depth[rim] / across[rim], rel=0.1)
+        assert np.isnan(slopes(GRIPPER, points, crease, axes, -offset_m)[edge]), "no bevel lies outside"
+        checked += 1
+    assert checked >= 4
 
 
 # --- all edges together ---
