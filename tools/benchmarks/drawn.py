@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings
-from gripmon.model.geometry import make_transform, perturb
-from gripmon.model.records import Array
+from gripmon.model.geometry import make_transform, perturb, to_record
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.simulate import PAPER_LENS
 from gripmon.simulate.scenario import FingerLook, Sensor
 
@@ -86,3 +86,9 @@ def sensor(rng: Rng) -> Sensor:
 def reference(rng: Rng, cam_T_grip: Array) -> Array:
     """A calibration (4, 4) that is off by :data:`REFERENCE_SIGMA`."""
     return perturb(cam_T_grip, rng.normal(0.0, REFERENCE_SIGMA))
+
+
+def reference_record(cam_T_grip: Array, covariance: Array | None = None, revision: int = 1) -> ReferenceRecord:
+    """What a monitor starts from: a calibration, and its covariance (6, 6); that of :func:`reference` for None."""
+    own = np.diag(REFERENCE_SIGMA**2) if covariance is None else covariance
+    return ReferenceRecord("start", revision, 0, "configuration", to_record(cam_T_grip), tuple(own.ravel().tolist()))

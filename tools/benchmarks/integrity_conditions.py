@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.integrity_draft import Changes, Condition, Draft, with_
+from benchmarks.integrity_scenes import Changes, Condition, Draft, with_
 from gripmon.model.records import Cause
 from gripmon.simulate.scenario import (
     BentFinger,

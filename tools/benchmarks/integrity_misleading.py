@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.integrity_conditions import MOVED, ORDINARY, bump
-from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, both, with_
+from benchmarks.integrity_scenes import Changes, Condition, Draft, Fingers, both, with_
 from gripmon.simulate.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
 
 _COMES, _GOES = 0.12, 0.88  # shares of the time at which what comes is there, and leaves again

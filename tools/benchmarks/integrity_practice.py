@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks import padded
 from benchmarks.integrity_conditions import MOVED, ORDINARY
-from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, with_
 from benchmarks.integrity_misleading import MISLEADING, OTHER_FINGERS
+from benchmarks.integrity_scenes import Changes, Condition, Draft, Fingers, with_
 from gripmon.simulate.scenario import Bump, GraspedObject, JawScript, LampChange, Light, LightStep, ObjectLook
 
 KNOCK_M, KNOCK_DEG, GRASPED_M = 2e-3, 0.55, 0.026
