@@ -58,10 +58,11 @@ def main() -> int:
 
 
 def _run(benchmark: object, arguments: argparse.Namespace, title: str) -> int:
-    from benchmarks.kit import Refused, Report
+    from benchmarks.kit import Refused, Report, writable
 
     name = " ".join(title.split()[:2])
     try:
+        writable(arguments.json, arguments.markdown)
         report = Report(title)
         ended = benchmark.run(arguments, report)  # type: ignore[attr-defined]
         return report.end(arguments.json, arguments.markdown) if ended is None else int(ended)

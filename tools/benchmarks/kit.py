@@ -137,6 +137,13 @@ def rms(values: Any, axis: Any = None) -> Any:
     return np.sqrt(np.nanmean(np.square(values), axis=axis))
 
 
+def writable(*files: Path | None) -> None:
+    """Refused before anything is measured: a file that can't be written."""
+    for file in files:
+        if file is not None and not os.access(file if file.exists() else file.parent, os.W_OK):
+            raise Refused(f"{file}: can't be written; a file in a folder of your own")
+
+
 def count(text: str) -> int:
     """A whole number from 0, as an argument's type."""
     return _from(0, text)
