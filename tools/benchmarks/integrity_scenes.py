@@ -7,15 +7,25 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from benchmarks import drawn, padded
-from benchmarks.drawn import Place, finger_look, in_view
+from benchmarks import padded
+from benchmarks.drawn import (
+    REFERENCE_SIGMA,
+    Changes,
+    Draft,
+    Draw,
+    Place,
+    drawn,
+    finger_look,
+    in_view,
+    reference,
+)
 from benchmarks.fingers import first_finger, gripper_models, gripper_of
 from benchmarks.rounded import rounded_model, rounded_solids
 from gripmon.model.camera import Camera, PaperLens, make_camera
@@ -23,7 +33,7 @@ from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 from gripmon.simulate import PAPER_LENS, Rig, Scenario, Simulator
-from gripmon.simulate.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
+from gripmon.simulate.scenario import Background, FingerMark, JawScript, Sensor
 
 LEAD_FRAMES = (15, 20)
 """Frames at the start of a scene in which the gripper is seen free."""
@@ -38,44 +48,20 @@ _KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
 _JAW_NOISE_M = 3e-5
 
 
-Changes = dict[str, Any]
-
-
 @dataclass(frozen=True)
-class Draft:
-    """What is drawn before the condition.
+class SceneDraft(Draft):
+    """And between which times things happen, ``start_s`` and ``end_s``: before and after, the gripper is free."""
 
-    ``start_s`` and ``end_s``: between them things happen; before and after, the gripper is free.
-    """
-
-    rng: np.random.Generator
-    frames: int
     fps: float
     start_s: float
     end_s: float
     gripper: Gripper
     cam_T_grip: Array
-    opening_m: float
-    background: Background
-    fingers: FingerLook
-    sensor: Sensor
     jaw: JawScript
 
     def at_s(self, share: float) -> float:
         """A time between start and end."""
         return self.start_s + share * (self.end_s - self.start_s)
-
-    def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
-
-    def sign(self) -> float:
-        return float(self.rng.choice((-1.0, 1.0)))
-
-    def chance(self, probability: float) -> bool:
-        return bool(self.rng.random() < probability)
-
-    def one_of(self, *values: Any) -> Any:
-        return values[int(self.rng.integers(len(values)))]
 
     def between_frames_s(self, share: float) -> float:
         """Near a share of the time, between two frames: a jump there is in no frame's exposure."""
@@ -124,7 +110,7 @@ class Condition:
 
     name: str
     what: str
-    changes: Callable[[Draft], Changes]
+    changes: Changes | Draw = field(default_factory=dict)
     enough: bool = True
     wrong: tuple[Cause, ...] = ()
     inside: bool = True
@@ -132,17 +118,13 @@ class Condition:
     fingers: Fingers = Fingers.USUAL
 
 
-def with_(settings: Any, **changes: Any) -> Any:
-    return msgspec.structs.replace(settings, **changes)
-
-
-def both(*parts: Callable[[Draft], Changes]) -> Callable[[Draft], Changes]:
+def both(*parts: Draw) -> Draw:
     """Several changes together; a later one wins where they meet."""
 
-    def changes(draft: Draft) -> Changes:
+    def changes(draft: SceneDraft) -> Changes:
         out: Changes = {}
         for part in parts:
-            out |= part(draft)
+            out |= drawn(draft, part)
         return out
 
     return changes
@@ -189,8 +171,8 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
         condition=condition,
         simulator=simulator,
         gripper=gripper,
-        start_cam_T_grip=drawn.reference(rng, simulator.truth(first).cam_T_grip),
-        start_covariance=np.diag(drawn.REFERENCE_SIGMA**2),
+        start_cam_T_grip=reference(rng, simulator.truth(first).cam_T_grip),
+        start_covariance=np.diag(REFERENCE_SIGMA**2),
         jaw_sigma_m=0.0 if scenario.jaw.reported_noise_m == 0.0 and not scenario.jaw.reported_offset_m else None,
         first=first,
         frames=frames,
@@ -216,7 +198,7 @@ def _round_tipped(rng: np.random.Generator) -> tuple[Gripper, Gripper]:
     return rounded_model(width_m, radius_m), rounded_solids(width_m, radius_m)
 
 
-def _scenario(condition: Condition, draft: Draft) -> Scenario:
+def _scenario(condition: Condition, draft: SceneDraft) -> Scenario:
     """An ordinary scene with the condition's changes."""
     sections: dict[str, Any] = {
         "name": condition.name,
@@ -227,10 +209,10 @@ def _scenario(condition: Condition, draft: Draft) -> Scenario:
         "sensor": draft.sensor,
         "jaw": draft.jaw,
     }
-    return Scenario(**{**sections, **condition.changes(draft)})
+    return Scenario(**{**sections, **drawn(draft, condition.changes)})
 
 
-def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: Array, opening_m: float) -> Draft:
+def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: Array, opening_m: float) -> SceneDraft:
     """Times and looks of an ordinary scene."""
     fps = float(rng.integers(15, 31))
     lead = int(rng.integers(LEAD_FRAMES[0], LEAD_FRAMES[1] + 1)) if frames >= 60 else max(frames // 4, 1)
@@ -248,7 +230,7 @@ def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: 
         marks=_marks(rng) if rng.random() < MARKED_SHARE else (),
     )
     noise_m = _JAW_NOISE_M if rng.random() < 0.5 else 0.0
-    return Draft(
+    return SceneDraft(
         rng=rng,
         frames=frames,
         fps=fps,
