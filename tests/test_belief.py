@@ -582,6 +582,6 @@ def test_sampled_runs_stay_within_their_bound(fault: str | None, within: float) 
     """Three runs each: a bound at 1e-3 that holds is hardly ever passed in 360 frames, and is worth something."""
     from benchmarks import belief as belief_bench
 
-    runs = [belief_bench.run(seed, belief_bench.Setup(fault=fault)) for seed in range(40, 43)]
+    runs = [belief_bench.one(seed, belief_bench.Setup(fault=fault)) for seed in range(40, 43)]
     assert sum(r.beyond[1] for r in runs) == 0
     assert sum(r.available[1] for r in runs) > within * sum(r.frames for r in runs)

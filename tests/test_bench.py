@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,22 +17,39 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def _small():
+    """The parts of the benchmark on few and small frames."""
     from benchmarks import latency
 
-    plan = latency.quick_plan()
-    loop = replace(plan.loop, frames=60, compared=200, block=50, beside=2, turns=1, turn=20, gone=110, staged=40)
-    program = replace(plan.program, daemon_s=1.0, replayed=12, calls=1)
-    return replace(plan, loop=loop, program=program, small=SIZE, ring=8, ring_gone=48)
+    loop = {"frames": 60, "compared": 200, "block": 50, "beside": 2, "turns": 1, "turn": 20, "gone": 110, "staged": 40}
+    program = {"daemon_s": 1.0, "replayed": 12, "calls": 1}
+    out = {}
+    for name, part in latency.PARTS.items():
+        plan = replace(part.plan, **part.quick)
+        changes = {key: value for key, value in (loop | program).items() if hasattr(plan, key)}
+        frames = [replace(f, size=SIZE, count=48 if f.kind in ("hidden", "lost") else 8) for f in part.frames]
+        out[name] = replace(part, plan=replace(plan, **changes), frames=tuple(frames))
+    return out
+
+
+def _measured(every, names, kept=None):
+    """What a report says of these parts."""
+    from benchmarks import parts
+    from benchmarks.kit import Report
+
+    report = Report("tools/bench latency")
+    asked = argparse.Namespace(list=False, quick=False, only=names, resume=kept)
+    assert parts.run(asked, report, every) is None
+    return report
 
 
 @pytest.mark.slow("40 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_parts_in_small(capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    from benchmarks import latency, stages
+    from benchmarks import stages
 
     names = ["frame", "plain", "hidden", "daemon", "replay", "profile"]
     kept = tmp_path / "kept.jsonl"
-    results = latency.measure(_small(), names, kept)
-    parts = {name: results["parts"][name] for name in names}
+    report = _measured(_small(), names, kept)
+    parts = report.values["parts"]
     rows = {name: {row["what"]: row for row in part["rows"]} for name, part in parts.items()}
     assert "received 120 of 120" in parts["frame"]["notes"][1]
     assert "longest of 60" in "".join(rows["frame"])
@@ -39,36 +58,58 @@ def test_parts_in_small(capsys: pytest.CaptureFixture[str], tmp_path: Path):
     assert valid["value"] == 0 and valid["note"] == "measured, but not valid: 0"
     assert all(row["value"] is None or row["value"] >= 0.0 for part in rows.values() for row in part.values())
     assert rows["daemon"]["frames that the recording dropped"]["value"] == 0
-    _, *lines = parts["profile"]["notes"]
-    assert [line[:46].strip() for line in lines] == list(stages.STAGES)
-    assert all(float(line[46:].split()[0]) > 0.0 for line in lines)  # none is passed by
+    cells = [[cell.strip() for cell in line.split("|")] for line in parts["profile"]["notes"][0].splitlines()[2:]]
+    assert [row[1] for row in cells] == list(stages.STAGES)
+    assert all(float(row[2].split(",")[0]) > 0.0 for row in cells)  # none is passed by
+    targets = sum(row["target"] is not None for part in parts.values() for row in part["rows"])
+    assert len(report.targets) == targets
     printed = capsys.readouterr().out
-    assert printed.count("  met") + printed.count("  missed") == sum(
-        row["target"] is not None for part in parts.values() for row in part["rows"]
-    )
+    assert len(re.findall(r"\| +(met|missed) +\|", printed)) == targets
     assert [json.loads(line)["part"] for line in kept.read_text().splitlines()] == names
 
 
 def test_finished_parts_are_not_measured_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    from benchmarks import latency, latency_rows
+    from benchmarks import kit, parts
 
     measured: list[str] = []
 
-    def measure(part, rings, plan):
-        measured.append(part.measure)
-        return latency_rows.Measured((latency_rows.Row("a figure", 2.0, "ms", 1.0),)).plain()
+    def measure(function, paths, plan):
+        measured.append(getattr(function, "func", function).__name__)
+        return parts.Measured((parts.Row("a figure", 2.0, "ms", 1.0),))
 
-    monkeypatch.setattr(latency, "_measured", measure)
-    kept, plan = tmp_path / "kept.jsonl", _small()
-    latency.measure(plan, ["frame"], kept)
+    monkeypatch.setattr(kit, "in_new_process", measure)
+    monkeypatch.setattr(parts.Rings, "of", lambda self, frames: tmp_path)
+    kept, every = tmp_path / "kept.jsonl", _small()
+    _measured(every, ["frame"], kept)
     with kept.open("a") as file:
         file.write('{"part": "hid')  # cut off
-    results = latency.measure(plan, ["frame", "hidden"], kept)
-    assert measured == ["loop.frame", "loop.gone hidden"]
-    assert [part["missed"] for part in results["parts"].values()] == [["a figure"], ["a figure"]]
+    report = _measured(every, ["frame", "hidden"], kept)
+    assert measured == ["frame", "gone"]
+    assert [target.met for target in report.targets] == [False, False]
     # Another amount of work is another measurement.
-    latency.measure(replace(plan, ring=9), ["frame"], kept)
-    assert measured[-1] == "loop.frame" and len(measured) == 3
+    more = replace(every["frame"], frames=(replace(every["frame"].frames[0], count=9),))
+    _measured({"frame": more}, ["frame"], kept)
+    assert measured[-1] == "frame" and len(measured) == 3
+
+
+def test_a_part_that_fails_is_missed_and_the_next_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from benchmarks import kit, parts
+
+    def measure(function, paths, plan):
+        if function is one:
+            raise RuntimeError("no camera")
+        return parts.Measured((parts.Row("a figure", 1.0, "ms", 1.0),))
+
+    def one() -> None: ...
+
+    def other() -> None: ...
+
+    monkeypatch.setattr(kit, "in_new_process", measure)
+    report = _measured({"one": parts.Part("the first", one, None), "other": parts.Part("the second", other, None)}, [])
+    assert [target.met for target in report.targets] == [False, True] and report.end(None, None) == 1
+    assert "no camera" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -77,24 +118,9 @@ def test_finished_parts_are_not_measured_again(monkeypatch: pytest.MonkeyPatch, 
      (None, 1.0, False, "")],
 )  # fmt: skip
 def test_a_row_says_whether_its_target_is_met(value, target, at_least, verdict):
-    from benchmarks.latency_rows import Row
+    from benchmarks.parts import Row
 
     assert Row("what", value, "ms", target, at_least).verdict == verdict
-
-
-def test_the_page_has_every_row_and_what_is_missed():
-    from benchmarks import latency_page
-    from benchmarks.latency_rows import Measured, Row
-
-    frame = Measured((Row("median", 0.4, "ms", 0.5), Row("longest", 31.5, "ms", 10.0)), ("a note",))
-    profile = Measured((Row("a frame", 0.4, "ms", note="whole loop 0.5 ms"),), ("predict   48 µs",))
-    machine = {"commit": "abc", "date": "today", "cpu": "c", "cpus": 2, "system": "s", "python": "3", "packages": {},
-               "load_before": 0.1}  # fmt: skip
-    parts = {"frame": frame.plain(), "profile": profile.plain()}
-    page = latency_page.as_markdown({"machine": machine, "parts": parts}, " --quick")
-    assert "`tools/bench latency --quick --out docs/results`" in page and "gripmon abc, today" in page
-    assert "| frame | median | 0.4 ms | at most 0.5 ms | met |  |" in page
-    assert "- longest (31.5 ms, at most 10 ms)" in page and "predict   48 µs" in page
 
 
 def test_stop_watches_count_every_nanosecond_once(monkeypatch: pytest.MonkeyPatch):

@@ -83,7 +83,7 @@ def track(error_um: np.ndarray, **changes: Any) -> Any:
 
 
 def test_figures_of_known_errors():
-    from benchmarks.accuracy_stats import figures
+    from benchmarks.accuracy_runs import figures
 
     error_um = np.zeros((100, 3))
     error_um[:, 0] = np.tile([1.0, -3.0], 50)
@@ -110,14 +110,14 @@ def test_figures_of_known_errors():
     ],
 )
 def test_verdicts(change: dict[str, Any], verdict: str):
-    from benchmarks.accuracy_stats import figures
+    from benchmarks.accuracy_runs import figures
 
     out = figures(track(np.ones((20, 3)), **change), 30.0, (2.0, 2.0, 2.0), always_seen=True, standing=False)
     assert out["verdict"] == verdict
 
 
 def test_a_misleading_transform_counts_also_where_errors_do_not():
-    from benchmarks.accuracy_stats import figures
+    from benchmarks.accuracy_runs import figures
 
     unjudged = track(np.ones((20, 3)), judged=np.arange(20) > 10, misleading=np.arange(20) == 4)
     out = figures(unjudged, 30.0, None, always_seen=True, standing=False)
@@ -145,23 +145,18 @@ def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
 
 
 @pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")
-def test_a_whole_run_in_small_leaves_a_report(tmp_path: Path):
-    from benchmarks import accuracy, accuracy_report, accuracy_table
+def test_a_whole_run_in_small_leaves_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from benchmarks.__main__ import main
 
-    plan = accuracy.Plan(only=("clean", "jaw exact"), scenes=2, frames=4, jobs=1, peers=True, series=False)
-    results, tracks = accuracy.measure(plan)
-    ours = results["rows"]["clean"]["ours"]["edges"]
+    file = tmp_path / "accuracy.json"
+    asked = ["accuracy", "--only", "clean", "jaw exact", "--scenes", "2", "--frames", "4", "--jobs", "1"]
+    monkeypatch.setattr("sys.argv", ["bench", *asked, "--json", str(file)])
+    assert main() == 0
+    ours = json.loads(file.read_text())["rows"]["clean"]["ours"]["edges"]
     assert ours["frames"] == 6 and ours["scenes"] == 2 and ours["measured"] == 1.0
     assert max(ours["mean_um"]) < 20.0
-    text = accuracy_table.as_text(results)
-    for word in ("clean", "by corners", "cornerSubPix", "rapid", "aruco", "0.5 / 1.5 / 2.5"):
+    text = capsys.readouterr().out
+    for word in ("| clean ", "clean, by corners", "clean, cornerSubPix", "clean, rapid", "aruco", "0.5 / 1.5 / 2.5"):
         assert word in text
-    (tmp_path / accuracy_report.PICTURES).mkdir()
-    pytest.importorskip("matplotlib")
-    accuracy_report.write(results, tracks, tmp_path)
-    report = (tmp_path / "accuracy.md").read_text()
-    assert results["machine"]["commit"] in report and "| jaw exact |" in report
-    for picture in ("errors_simulated", "peers", "honesty"):
-        assert f"(accuracy/{picture}.png)" in report
-        assert (tmp_path / "accuracy" / f"{picture}.png").stat().st_size > 5000
-    assert json.loads((tmp_path / "accuracy.json").read_text())["rows"]["clean"]["ours"]["edges"]["frames"] == 6

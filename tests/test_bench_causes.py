@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
 from benchmarks import causes
-from benchmarks.causes_runs import Told
+from benchmarks.causes import Told
 from benchmarks.causes_trials import ROWS, make_trial
 
 from gripmon.model.records import Cause

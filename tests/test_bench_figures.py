@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
@@ -55,8 +53,9 @@ def test_slopes_and_their_errors_are_right():
     assert abs(np.mean(found)) < 0.3 and 0.9 < np.std(found) < 1.45
 
 
-def test_the_report_counts_by_hand():
-    from benchmarks.recalibration import Outcome, as_text
+def test_the_report_counts_by_hand(capsys: pytest.CaptureFixture[str]):
+    from benchmarks.kit import Report
+    from benchmarks.recalibration import Outcome, show
 
     outcomes = [
         Outcome(0, "a", "nothing", "accepted", "", 21, 1e-5, 1e-5),
@@ -66,22 +65,23 @@ def test_the_report_counts_by_hand():
         Outcome(4, "e", "nothing", "refused", "few_corners", 20),
         Outcome(5, "f", "nothing", "lost", "", 15),
     ]
-    machine = {"commit": "c", "date": "d", "cpu": "p", "cpus": 2, "system": "s"}
-    text = as_text(machine, 7, outcomes)
-    rows = {
-        line[:20].strip(): line[20:].split() for line in text.splitlines() if re.match(r"^(nothing|defocus|all) ", line)
-    }
+    report = Report("tools/bench recalibration")
+    show(outcomes, report)
+    text = capsys.readouterr().out
+    cells = [[cell.strip() for cell in line.strip("| ").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    rows = {row[0]: row[1:] for row in cells}
     assert rows["nothing"] == ["4", "2", "0", "0", "1", "0", "0", "1", "0"]
     assert rows["defocus"] == ["2", "0", "1", "1", "0", "0", "0", "0", "0"]
     assert rows["all"] == ["6", "2", "1", "1", "1", "0", "0", "1", "0"]
-    assert "WRONG by 0.051 mm: trial 2, c" in text and "NOT MET" in text
+    assert "WRONG by 0.051 mm: trial 2, c" in text and "MISSED" in text and report.end(None, None) == 1
     assert "within 0.05 mm: 2 of 3" in text and "frames until accepted: median 23" in text
     # Clopper and Pearson for 1 of 6, from the binomial distribution by hand: 5 % where P(at most 1 of 6) = 0.05.
     chance = 0.5818
     assert (1 - chance) ** 6 + 6 * chance * (1 - chance) ** 5 == pytest.approx(0.05, abs=1e-3)
-    assert "wrong: 1 of 6 trials, at most 58.18 %" in text
-    fine = as_text(machine, 7, outcomes[:2])
-    assert "   met" in fine and "NOT MET" not in fine
+    assert "1: of 6 trials, at most 58.18 %" in text
+    fine = Report("tools/bench recalibration")
+    show(outcomes[:2], fine)
+    assert [target.met for target in fine.targets] == [True] and fine.end(None, None) == 0
 
 
 def test_the_summary_of_laser_trials_is_honest_about_failures_and_bounds():

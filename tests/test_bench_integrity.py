@@ -238,10 +238,11 @@ def test_back_within_three_frames_after_the_view_is_free(valid: list[int], back:
 
 
 def test_the_bound_on_a_rate_is_exact():
-    from benchmarks.integrity_stats import upper_bound
+    from benchmarks.kit import at_least, at_most
 
-    assert upper_bound(0, 100_000) == pytest.approx(1.0 - 0.05 ** (1e-5), rel=1e-6)
-    assert upper_bound(3, 3) == 1.0 and 0.0 < upper_bound(1, 100) < 0.05
+    assert at_most(0, 100_000) == pytest.approx(1.0 - 0.05 ** (1e-5), rel=1e-6)
+    assert at_most(3, 3) == 1.0 and 0.0 < at_most(1, 100) < 0.05
+    assert at_least(97, 100) == pytest.approx(1.0 - at_most(3, 100)) and at_least(0, 5) == 0.0
 
 
 def test_the_least_possible_level_is_that_of_the_worst_axis():
@@ -252,35 +253,49 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
 
 
 @pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
-def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(tmp_path: Path):
-    from benchmarks import integrity, integrity_report, integrity_table
+def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from benchmarks import integrity
+    from benchmarks.__main__ import main
 
-    state = tmp_path / "state.jsonl"
-    plan = integrity.Plan(only=("grasp", "model off"), scenes=1, frames=8, seed=2, jobs=1, state=state)
-    lines = integrity.measure(plan)
-    assert [(one["condition"], one["scene"], len(one["view"])) for one in lines] == [
-        ("model off", 0, 8),
+    state, file = tmp_path / "state.jsonl", tmp_path / "integrity.json"
+    asked = ["--only", "grasp", "model off", "--scenes", "1", "--frames", "8", "--seed", "2", "--jobs", "1"]
+    monkeypatch.setattr("sys.argv", ["bench", "integrity", *asked, "--resume", str(state), "--json", str(file)])
+    main()
+    first = integrity.read_lines(state)
+    assert sorted((line["condition"], line["scene"], len(line["view"])) for line in first.values()) == [
         ("grasp", 0, 8),
+        ("model off", 0, 8),
     ]
     kept = state.read_text().splitlines()
     # The first line is marked: if it comes back, it was not run again.  The second was cut off: it is.
     marked = {**json.loads(kept[0]), "seconds": 12345.0}
     state.write_text("\n".join([json.dumps(marked), kept[1][:50]]))
-    more = integrity.measure(plan)
-    assert sorted(one["seconds"] == 12345.0 for one in more) == [False, True]
-    assert [one["error_m"] for one in more] == [one["error_m"] for one in lines]
-    assert len(integrity.read_lines(state)) == 2
-
-    results = integrity_report.summarize(more, plan.seed, plan.scenes, plan.frames)
-    text = integrity_table.as_text(results)
-    for word in ("model off", "grasp", "MISSED", "--seed 2 --scene 0", results["commits"][0]):
+    main()
+    more = integrity.read_lines(state)
+    assert sorted(line["seconds"] == 12345.0 for line in more.values()) == [False, True]
+    assert all(line["error_m"] == first[key]["error_m"] for key, line in more.items())
+    text = capsys.readouterr().out
+    for word in ("| model off ", "| grasp ", "MISSED", "--seed 2 --scene 0", marked["commit"]):
         assert word in text
-    assert "frame" in integrity_table.frame_lines(more[0])[1]
+    assert json.loads(file.read_text())["total"]["scenes"] == 2
+
+
+def test_two_revisions_stand_in_each_cell(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    from benchmarks import integrity
+    from benchmarks.kit import Report
+
+    before = line(commit="old", valid=[True] * 5 + [False] * 5)
+    integrity._compare([line(), line(scene=1)], [before, line(scene=7)], Report("tools/bench integrity"))
+    text = capsys.readouterr().out
+    assert "old → abc, seed 1, 1 scenes of both" in text and "1 scenes only here" in text
+    assert "44.4 → 100.0" in text and "valid in both 4, only before 0, only after 5, in neither 0" in text
+
+
+def test_a_picture_has_each_frame(tmp_path: Path):
     pytest.importorskip("matplotlib")
-    (tmp_path / integrity_report.PICTURES).mkdir()
-    integrity_report.write(results, more, tmp_path)
-    report = (tmp_path / "integrity.md").read_text()
-    for picture in ("all", "conditions_1"):
-        assert f"(integrity/{picture}.png)" in report
-        assert (tmp_path / "integrity" / f"{picture}.png").stat().st_size > 5000
-    assert json.loads((tmp_path / "integrity.json").read_text())["total"]["scenes"] == 2
+    from benchmarks import integrity_plots
+
+    integrity_plots.draw([line(), line(scene=1)], tmp_path / "all.png")
+    assert (tmp_path / "all.png").stat().st_size > 5000

@@ -165,8 +165,11 @@ def test_each_target_that_is_missed_is_named():
     assert missed([(xarm, replace(good, valid=11)), (xarm, good)]) == []  # one way of two is enough
 
 
-def test_rows_of_two_commits_stand_beside_each_other_however_many_bounds_they_have():
-    from benchmarks.real import report
+def test_rows_of_two_commits_stand_beside_each_other_however_many_bounds_they_have(
+    capsys: pytest.CaptureFixture[str],
+):
+    from benchmarks.kit import Report
+    from benchmarks.real import show
     from benchmarks.real_figures import figures_of
 
     def rows(*bounds):
@@ -178,9 +181,10 @@ def test_rows_of_two_commits_stand_beside_each_other_however_many_bounds_they_ha
         ]
         return [(run, figures_of(run)) for run in runs]
 
-    text = report({"before": rows("absolute"), "now": rows("reference", "absolute")}, [])
-    cells = [line.strip("| ").split(" | ")[:3] for line in text.splitlines()[2:] if line.startswith("| ")]
-    assert cells == [
+    report = Report("tools/bench real")
+    show({"before": rows("absolute"), "now": rows("reference", "absolute")}, [], report)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert [[cell.strip() for cell in line.strip("|").split("|")][:3] for line in lines[2:]] == [
         [f"{name}, {way}", *of]
         for name in ("one", "other")
         for way in ("untaught", "taught")
@@ -297,24 +301,22 @@ def bench(*arguments: str) -> int:
 def test_folders_without_a_configuration_are_named_and_left_out(
     stills: Path, replayed, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    from benchmarks import real, real_runs
+    from benchmarks import real
 
-    monkeypatch.setattr(real_runs, "runs_of", lambda name, folder, limit: replayed if folder == stills else [])
+    monkeypatch.setattr(real, "runs_of", lambda name, folder, limit: replayed if folder == stills else [])
     (stills.parent / "video").mkdir(exist_ok=True)
     monkeypatch.setattr(real, "FOLDER", stills.parent)
     monkeypatch.setattr(real, "LIMITS", {"simulated": WIDE})
     code = bench()
     printed = capsys.readouterr()
     assert "video: skipped, it has no config.yaml" in printed.err
-    assert [line.split(" | ")[0] for line in printed.out.splitlines() if " | absolute | " in line] == [
-        "| simulated, untaught",
-        "| simulated, taught",
-    ]
+    rows = [[cell.strip() for cell in line.split("|")] for line in printed.out.splitlines()]
+    assert [row[1] for row in rows if "absolute" in row] == ["simulated, untaught", "simulated, taught"]
     assert code == ("MISSED" in printed.out)
 
 
 def test_another_commit_is_replayed_with_its_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from benchmarks import revision
+    from benchmarks import machine as revision
 
     if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, check=False).returncode != 0:
         pytest.skip("this is no git checkout")

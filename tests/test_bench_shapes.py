@@ -13,8 +13,7 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 def test_a_row_says_what_was_valid_how_far_it_was_off_and_what_was_missed():
     from benchmarks import shapes
 
-    lines = list(shapes.report(12, 1, ["rounded by 2 mm"]))[2:]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    cells = list(shapes.rows(12, 1, ["rounded by 2 mm"]))
     assert [row[:2] for row in cells] == [
         [name, motion] for name in ("sharp box", "rounded by 2 mm") for motion in shapes.MOTIONS
     ]
@@ -45,7 +44,7 @@ def test_the_border_leaves_as_much_of_the_fingers_as_is_said():
     from gripmon.model.camera import PaperLens, make_camera
 
     camera = make_camera(PaperLens(width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5))
-    pose = shapes._pose(camera, cut=True)
+    pose = shapes.pose_of(camera, cut=True)
     tip = pose[:3, :3] @ np.array([0.022, -0.008, 0.0]) + pose[:3, 3]
     assert camera.project(tip[None])[0, 1] == pytest.approx(575.0 - shapes.SHOWN_PX, abs=0.1)
 
@@ -57,6 +56,6 @@ def test_fingers_of_which_forty_pixels_show_are_valid_while_the_camera_stands(
     from benchmarks import shapes
 
     monkeypatch.setattr(shapes, "SHOWN_PX", 40.0)
-    (cut,) = (shape for shape in shapes.shapes() if shape.name == "sharp box, cut by the border")
+    (cut,) = (shape for shape in shapes.SHAPES if shape.name == "sharp box, cut by the border")
     seen = shapes.track(cut, 0.0, 0.0, 20, 1, tmp_path)
     assert seen.valid >= 0.8 * seen.frames and not seen.misleading and not seen.beyond

@@ -129,9 +129,12 @@ def test_nothing_is_grasped_by_what_is_suspect():
     assert world.servo.grasped
 
 
-def test_a_real_monitor_over_zenoh_brings_the_arm_to_the_object(tmp_path: Path):
+def test_a_real_monitor_over_zenoh_brings_the_arm_to_the_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """The whole loop once, with a hand in the view: half the usual frames, so that it doesn't take long."""
-    from servoing import plot, report, runs, stage
+    from benchmarks.kit import Report
+    from servoing import report, runs, stage
     from servoing.figures import conduct, figures, targets
 
     row, steps = stage.ROWS[3], []
@@ -145,17 +148,14 @@ def test_a_real_monitor_over_zenoh_brings_the_arm_to_the_object(tmp_path: Path):
         assert own.unknown > 5 and own.breaches == 0
     # The rule is one that arms without it break in this very run.
     assert conduct(run, run.tracks["truth"]).moved_on_unknown > 5
-    every = figures([run])
-    reached = targets(every)
-    assert all(target.met for target in reached)
-    text = report.as_text({"commit": "c", "date": "d", "cpu": "p", "cpus": 2}, [run], every, reached)
-    assert "NOT MET" not in text and "4.5 mm, then a hand, 1 runs" in text
+    assert all(target.met for target in targets(figures([run])))
+    said = Report("tools/servo")
+    report.show([run], said)
+    assert said.end(tmp_path / "servo.json", None) == 0
+    text = capsys.readouterr().out
+    assert "MISSED" not in text and text.count("| 4.5 mm, then a hand |") == 4
     # Past policy.limit_m the reference is measured again, and the arm is under way by both.
     assert set(run.revision) == {0, 1} and "before the fingers closed: 1 of 1" in text
-    values = json.loads(json.dumps(report.as_values({}, every, reached)))
+    values = json.loads((tmp_path / "servo.json").read_text())
     assert [each["source"] for each in values["rows"]] == list(runs.SOURCES)
     assert values["rows"][1]["final_m"] == [off_m["gripmon"]]
-    assert report.markdown(every).count("\n") == 5
-    if pytest.importorskip("matplotlib"):
-        plot.draw([run], tmp_path / "servo.png")
-        assert (tmp_path / "servo.png").read_bytes().startswith(b"\x89PNG")

@@ -107,11 +107,11 @@ PAUSES = [0.0, 1.0, 2.0, 2.0, 3.0]
 @pytest.mark.parametrize(
     ("off_mm", "verdicts", "places", "code", "said"),
     [
-        (0.059, "vvuvv", PAUSES, 0, "no move on unknown: 0 in 8 frames   met"),
-        (0.061, "vvuvv", PAUSES, 1, "worse than with truth, in every run: 0.051 mm   NOT MET"),
-        (0.02, "vvuvv", MOVES, 1, "no move on unknown: 8 in 8 frames   NOT MET"),
-        (0.02, "vvvvv", MOVES, 1, "no move on unknown: 0 in 0 frames   NOT MET"),  # the rule wasn't tried
-        (0.02, "vvuvs", PAUSES, 1, "closed by what is not valid: 8   NOT MET"),
+        (0.059, "vvuvv", PAUSES, 0, "- met: no move on unknown: 0 in 8 frames"),
+        (0.061, "vvuvv", PAUSES, 1, "worse than with truth, in every run: 0.051 mm"),
+        (0.02, "vvuvv", MOVES, 1, "- MISSED: no move on unknown: 8 in 8 frames"),
+        (0.02, "vvvvv", MOVES, 1, "- MISSED: no move on unknown: 0 in 0 frames"),  # the rule wasn't tried
+        (0.02, "vvuvs", PAUSES, 1, "closed by what is not valid: 8"),
     ],
 )
 def test_the_exit_code_says_whether_all_was_reached(

@@ -268,9 +268,9 @@ def test_a_lone_finger_is_valid_where_it_was_or_is_seen_along_itself(
     """Its end's two corners prove a place from which the edges don't show apart, but not one that is 4 px farther in
     the next frame: corners of other things are seen there, too.  They don't have the finger's mark behind them.
     """
-    from benchmarks.shapes import MOTIONS, shapes, track
+    from benchmarks.shapes import MOTIONS, SHAPES, track
 
-    [shape] = (replace(shape, tone=tone) for shape in shapes() if shape.name == "sharp box, one finger")
+    [shape] = (replace(shape, tone=tone) for shape in SHAPES if shape.name == "sharp box, one finger")
     seen = track(shape, *MOTIONS[motion], 60, 1, tmp_path)
     # The beginning of the motion, some 0.6 mm, is within what the reference allows.
     assert seen.valid == pytest.approx(valid * seen.frames, abs=3 if valid else 18) and seen.beyond == 0

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks import kit
 from benchmarks.belief_world import DT_S, FAULTS, SECOND, World
+from benchmarks.kit import Report
 from gripmon.belief.core import Belief
 from gripmon.belief.doubts import ALL_ENDS, FINGER, FOOLED_SHARE
 from gripmon.belief.state import Priors
@@ -26,17 +25,13 @@ FRAMES = 120
 RISKS = (1e-2, 1e-3, 1e-4)
 ALERT_M, ALERT_RAD = 1e-3, math.radians(1.0)
 VARIED = (
-    "knock_per_s",
-    "small_per_s",
-    "small_m",
-    "lasting_px",
-    "near_px",
-    "far_px",
-    "creep_m_s",
-    "length_m",
-    "light_px",
-)
+    "knock_per_s", "small_per_s", "small_m", "lasting_px", "near_px", "far_px", "creep_m_s", "length_m", "light_px",
+)  # fmt: skip
 """Priors that ``--sensitivity`` changes by three, in the belief alone, in the own world without a rare fault."""
+_HEAD = (
+    "", "runs", *(f"beyond at {r:.0e} (runs)" for r in RISKS), "within 1 mm, 1 degree, %", "error mm",
+    "bound mm at 1e-3", "dropped a frame",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,8 +59,68 @@ class Run(NamedTuple):
     cpu_s: tuple[float, ...]
 
 
-def run(seed: int, setup: Setup) -> Run:
-    """One, of a seed."""
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
+    kit.numbers(
+        parser,
+        runs=(60, "without a rare fault; a sixth of them with each"),
+        jobs=(2, "runs at the same time"),
+        most=(256, "hypotheses kept"),
+    )
+    parser.add_argument("--world", choices=("own", "second", *SECOND), default="own", help="that is sampled")
+    parser.add_argument("--search-off", action="store_true", help="without the search")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--sample", action="store_true", help="the risk of a world, by strata")
+    what.add_argument("--sensitivity", action="store_true", help="priors times 3 and by 3, in the belief alone")
+
+
+def run(arguments: argparse.Namespace, report: Report) -> None:
+    setup = Setup(most=arguments.most, searching=not arguments.search_off)
+    report.say(f"seed {arguments.seed}, {FRAMES} frames a run, at most {arguments.most} hypotheses")
+    if arguments.sample:
+        report.say(f"{arguments.world} world")
+        worlds = {"own": (), "second": SECOND, **{name: (name,) for name in SECOND}}
+        _sampled(arguments, replace(setup, differs=worlds[arguments.world]), report)
+        return
+    rows = []
+    for name in VARIED:
+        for factor in (1.0 / 3.0, 3.0):
+            priors = replace(Priors(), **{name: factor * asdict(Priors())[name]})
+            runs = many(arguments, 0, arguments.runs, replace(setup, priors=priors))
+            rows.append(row(f"{name} x {factor:.2g}", runs))
+    report.say(kit.table(_HEAD, rows))
+
+
+def _sampled(arguments: argparse.Namespace, setup: Setup, report: Report) -> None:
+    """The table by strata, and the risk of all together."""
+    usual = many(arguments, 0, arguments.runs, setup)
+    rows, risk = [row("no rare fault", usual)], _risk(usual)
+    for fault in FAULTS:
+        forced = many(arguments, 10**6, max(arguments.runs // 6, 1), replace(setup, fault=fault))
+        rows.append(row(fault, forced))
+        risk += probability(fault, Priors()) * (10.0 if "rates" in setup.differs else 1.0) * _risk(forced)
+    ratios = ", ".join(f"{s / r:.2g} at {r:.0e}" for s, r in zip(risk, RISKS, strict=True))
+    cpu = 1e3 * np.concatenate([r.cpu_s[1:] for r in usual])
+    report.say(
+        kit.table(_HEAD, rows),
+        f"sampled risk over stated risk: {ratios}",
+        f"a frame: median {np.median(cpu):.2f} ms, 99 % {np.quantile(cpu, 0.99):.2f} ms of processor time",
+    )
+
+
+def _risk(runs: list[Run]) -> np.ndarray:
+    return np.array([np.mean([r.beyond[k] / r.frames for r in runs]) for k in range(len(RISKS))])
+
+
+def many(arguments: argparse.Namespace, offset: int, count: int, setup: Setup) -> list[Run]:
+    """So many runs, in the order of their seeds."""
+    first = arguments.seed + offset
+    done = kit.in_processes(one, [(seed, setup) for seed in range(first, first + count)], arguments.jobs, "run")
+    return [found for _, found in sorted(done, key=lambda pair: pair[0][0])]
+
+
+def one(seed: int, setup: Setup) -> Run:
+    """A run."""
     world = World(np.random.default_rng(seed), Priors(), FRAMES, setup.fault, setup.differs)
     belief = Belief(
         world.view.doubts, world.view.axis, setup.priors, risk=RISKS[-1], most=setup.most, searching=setup.searching
@@ -108,89 +163,13 @@ def probability(fault: str, priors: Priors) -> float:
     }[fault]
 
 
-def many(seeds: range, setup: Setup, jobs: int) -> list[Run]:
-    """All of them."""
-    with ProcessPoolExecutor(jobs) as pool:
-        out = []
-        for n, done in enumerate(pool.map(partial(run, setup=setup), seeds), 1):
-            out.append(done)
-            print(f"\r{setup.fault or 'no rare fault'}: {n} of {len(seeds)} runs", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    return out
-
-
-def row(name: str, runs: list[Run]) -> str:
+def row(name: str, runs: list[Run]) -> list[str]:
     """A line of the table."""
     frames = sum(r.frames for r in runs)
-    beyond = [sum(r.beyond[k] for r in runs) / frames for k in range(len(RISKS))]
-    bad = [sum(r.beyond[k] > 0 for r in runs) for k in range(len(RISKS))]
-    available = [100.0 * sum(r.available[k] for r in runs) / frames for k in range(len(RISKS))]
-    cells = " | ".join(f"{b:.1e} ({n})" for b, n in zip(beyond, bad, strict=True))
-    shares = ", ".join(f"{a:.1f}" for a in available)
-    middle = f"{1e3 * np.median([r.error_m for r in runs]):.4f} | {1e3 * np.median([r.bound_m for r in runs]):.3f}"
-    return f"| {name} | {len(runs)} | {cells} | {shares} | {middle} | {np.mean([r.dropped for r in runs]):.1e} |"
-
-
-HEAD = (
-    "| | runs | " + " | ".join(f"beyond at {r:.0e} (runs)" for r in RISKS) + " | within 1 mm, 1 degree, % | "
-    "error mm | bound mm at 1e-3 | dropped a frame |\n" + "|---" * (6 + len(RISKS)) + "|"
-)
-
-
-def sampled(seed: int, runs: int, jobs: int, differs: tuple[str, ...], setup: Setup) -> None:
-    """The table by strata, and the risk of all together."""
-    print(HEAD)
-    usual = many(range(seed, seed + runs), replace(setup, differs=differs), jobs)
-    print(row("no rare fault", usual), flush=True)
-    risk = np.array([np.mean([r.beyond[k] / r.frames for r in usual]) for k in range(len(RISKS))])
-    few = max(runs // 6, 1)
-    for fault in FAULTS:
-        forced = many(range(seed + 10**6, seed + 10**6 + few), replace(setup, fault=fault, differs=differs), jobs)
-        print(row(fault, forced), flush=True)
-        weight = probability(fault, Priors()) * (10.0 if "rates" in differs else 1.0)
-        risk += weight * np.array([np.mean([r.beyond[k] / r.frames for r in forced]) for k in range(len(RISKS))])
-    print(
-        "\nsampled risk over stated risk: "
-        + ", ".join(f"{s / r:.2g} at {r:.0e}" for s, r in zip(risk, RISKS, strict=True))
-    )
-    cpu = 1e3 * np.concatenate([r.cpu_s[1:] for r in usual])
-    print(
-        f"a frame: median {np.median(cpu):.2f} ms, 99 % {np.quantile(cpu, 0.99):.2f} ms of processor time\n", flush=True
-    )
-
-
-def handle(arguments: argparse.Namespace) -> int:
-    setup = Setup(most=arguments.most, searching=not arguments.search_off)
-    print(f"seed {arguments.seed}, {FRAMES} frames a run, at most {arguments.most} hypotheses\n")
-    worlds = {"own": (), "second": SECOND, **{name: (name,) for name in SECOND}}
-    if arguments.sensitivity:
-        print(HEAD)
-        for name in VARIED:
-            for factor in (1.0 / 3.0, 3.0):
-                priors = replace(Priors(), **{name: factor * asdict(Priors())[name]})
-                runs = many(
-                    range(arguments.seed, arguments.seed + arguments.runs),
-                    replace(setup, priors=priors),
-                    arguments.jobs,
-                )
-                print(row(f"{name} x {factor:.2g}", runs), flush=True)
-        return 0
-    print(f"{arguments.world} world\n")
-    sampled(arguments.seed, arguments.runs, arguments.jobs, worlds[arguments.world], setup)
-    return 0
-
-
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("belief", description=__doc__, help="sampled risk of the belief's bound")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--runs", type=int, default=60, help="without a rare fault; a sixth of them with each (default 60)"
-    )
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--most", type=int, default=256, help="hypotheses kept (default 256)")
-    parser.add_argument("--world", choices=("own", "second", *SECOND), default="own")
-    parser.add_argument("--search-off", action="store_true", help="without the search")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--sample", action="store_true", help="the risk of a world, by strata")
-    what.add_argument("--sensitivity", action="store_true", help="priors times 3 and by 3, in the belief alone")
-    parser.set_defaults(handler=handle)
+    beyond = [(sum(r.beyond[k] for r in runs) / frames, sum(r.beyond[k] > 0 for r in runs)) for k in range(len(RISKS))]
+    available = [f"{100.0 * sum(r.available[k] for r in runs) / frames:.1f}" for k in range(len(RISKS))]
+    return [
+        name, str(len(runs)), *(f"{part:.1e} ({bad})" for part, bad in beyond), ", ".join(available),
+        f"{1e3 * np.median([r.error_m for r in runs]):.4f}", f"{1e3 * np.median([r.bound_m for r in runs]):.3f}",
+        f"{np.mean([r.dropped for r in runs]):.1e}",
+    ]  # fmt: skip

@@ -1,9 +1,14 @@
-"""``tools/bench dataset``: a thousand episodes in one call: rate, memory, a kill in the middle, and Ray."""
+"""A thousand episodes in one call: rate, memory, a kill in the middle, and Ray.
+
+gripmon dataset on simulated episodes of 10 s (30 frames/s, AV1). One process on a tenth of them; two processes on all,
+killed by SIGKILL in the middle and called again; Ray on all, with one node of one core and a second one that joins
+after a third; what an episode costs that fails at once, by both; and the driver's end on ten times as many rows.
+Needs '.[datasets,ray]' and two quiet cores; --size 768x576 --episodes 100 is the row for planning.
+"""
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import re
 import resource
@@ -14,17 +19,22 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import machine, options
+import numpy as np
+import psutil
 
-_DESCRIPTION = """\
-gripmon dataset on simulated episodes of 10 s (30 frames/s, AV1). One process on a tenth of them; two processes on all,
-killed by SIGKILL in the middle and called again; Ray on all, with one node of one core and a second one that joins
-after a third; what an episode costs that fails at once, by both; and the driver's end on ten times as many rows.
-Needs '.[datasets,ray]' and two quiet cores; --size 768x576 --episodes 100 is the row for planning."""
+from benchmarks import kit
+from benchmarks.dataset_set import render, write_config, write_damaged, write_set
+from benchmarks.kit import Report
+from gripmon.analyse.dataset import Results, write_table
+from gripmon.analyse.dataset_page import write_page
+from gripmon.analyse.stretches import Stretch
+from gripmon.io.sources import BagSettings
+from gripmon.io.sources.episodes import Episode
+
 _LOOK_S = 0.5
 _TARGET_RATIO, _TARGET_GB = 1.9, 2.0
 
@@ -52,30 +62,21 @@ class Call:
         return (len(stored) - 1) / (stored[-1] - stored[0]) if len(stored) > 1 else float("nan")
 
 
-def add_parser(commands: Any) -> None:
-    """Add the benchmark."""
-    parser = options.add_command(
-        commands, "dataset", run, "episodes in bulk: rate, memory, a kill, Ray", _DESCRIPTION, as_json="all figures",
-        markdown=True,
-    )  # fmt: skip
-    parser.add_argument("--episodes", type=options.positive, default=1000, metavar="N", help="(default 1000)")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    kit.numbers(parser, episodes=(1000, "in the dataset"))
     parser.add_argument("--size", default="384x288", metavar="WxH", help="of the images, px (default 384x288)")
     parser.add_argument("--no-ray", action="store_true", help="leave Ray out")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Measure and print; 1 if a target is missed."""
-    from benchmarks.dataset_set import render, write_config, write_damaged, write_set
-
+def run(arguments: argparse.Namespace, report: Report) -> None:
     width, height = (int(part) for part in arguments.size.split("x"))
     episodes, few = arguments.episodes, max(arguments.episodes // 10, 4)
-    described = machine.description()
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as name:
         folder = Path(name)
         write_config(folder / "c.yaml", (width, height))
         openings_m = render(folder, folder / "c.yaml")
-        for root, count in (("few", few), ("all", episodes)):
-            write_set(folder / root, folder, openings_m, (width, height), count)
+        for root, number in (("few", few), ("all", episodes)):
+            write_set(folder / root, folder, openings_m, (width, height), number)
         write_damaged(folder / "damaged", episodes)
         calls = {"one process": call(folder, "few", "one")}
         calls["two, killed"] = call(folder, "all", "two", workers=2, kill_at=episodes // 2)
@@ -88,13 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
                 join.due = episodes // 3
                 calls["Ray"] = call(folder, "all", "ray", address=address, look=join)
                 joined_s = join.at_s
-        end = driver_end(folder / "end", 10 * episodes)
+        end = kit.in_new_process(driver_end, folder / "end", 10 * episodes)
         same = _same(folder / "two", folder / "ray")
-    described["load_after"] = machine.load()
-    text, good = report(described, arguments, calls, joined_s, end, same)
-    results = {"machine": described, "calls": {n: asdict(c) for n, c in calls.items()}, "joined_s": joined_s, **end}
-    options.deliver(arguments, "dataset", text, results)
-    return 0 if good else 1
+    report.values |= {"calls": calls, "joined_s": joined_s, **end}
+    report.say(f"{episodes} episodes of 10 s, {arguments.size} px, AV1")
+    show(calls, episodes, joined_s, end, same, report)
 
 
 def call(
@@ -110,8 +109,6 @@ def call(
     """``gripmon dataset`` in a process of its own, killed once ``kill_at`` episodes are stored; ``look`` is called
     with their number now and then.
     """
-    import psutil
-
     to = folder / out
     before = set(to.glob("episodes-*/*.parquet"))
     command = [sys.executable, "-m", "gripmon", "dataset", str(folder / dataset), "--config", str(folder / "c.yaml")]
@@ -152,8 +149,6 @@ _seen_s = [0.0]
 
 
 def _memory(root: Any) -> int:
-    import psutil
-
     total = 0
     for process in [root, *root.children(recursive=True)]:
         try:
@@ -197,20 +192,6 @@ def _same(one: Path, other: Path) -> bool | None:
 
 def driver_end(folder: Path, rows: int) -> dict[str, float]:
     """Processor time of storing a row, and of table, mountings and report for each; peak memory."""
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(1) as pool:
-        return dict(pool.apply(_driver_end, (folder, rows)))
-
-
-def _driver_end(folder: Path, rows: int) -> dict[str, float]:
-    import numpy as np
-
-    from gripmon.analyse.dataset import Results, write_table
-    from gripmon.analyse.dataset_page import write_page
-    from gripmon.analyse.stretches import Stretch
-    from gripmon.io.sources import BagSettings
-    from gripmon.io.sources.episodes import Episode
-
     folder.mkdir()
     rng = np.random.default_rng(1)
     covariance = tuple(np.diag([1e-9] * 3 + [1e-7] * 3).ravel().tolist())
@@ -243,41 +224,42 @@ def _peak_gb() -> float:
     return 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def report(
-    described: dict[str, Any], arguments: argparse.Namespace, calls: dict[str, Call], joined_s: float,
-    end: dict[str, float], same: bool | None,
-) -> tuple[str, bool]:  # fmt: skip
-    """The text, and whether the targets are met."""
+def show(
+    calls: dict[str, Call], episodes: int, joined_s: float, end: dict[str, float], same: bool | None, report: Report
+) -> None:
+    """A row a call, what follows from them, and the targets."""
     one, killed, again = calls["one process"], calls["two, killed"], calls["two, again"]
-    lines = [*machine.machine_lines(described), f"{arguments.episodes} episodes of 10 s, {arguments.size} px, AV1", ""]
-    lines.append("| call | episodes | took, s | episodes/s | processor time, s/episode | memory, GB |")
-    lines.append("| --- | --- | --- | --- | --- | --- |")
+    lines = []
     for name, each in calls.items():
-        cpu = each.cpu_s / max(each.measured, 1)
-        took = f"{each.end_s - each.begin_s:.0f} | {each.rate:.3f} | {cpu:.2f} | {each.peak_gb:.2f}"
-        lines.append(f"| {name} | {each.measured} | {took} |")
-    ratio, peak_gb = again.rate / one.rate, max(killed.peak_gb, again.peak_gb)
-    lost = killed.measured + again.measured - arguments.episodes
-    good = ratio >= _TARGET_RATIO and peak_gb <= _TARGET_GB and lost == 0 and same is not False
-    lines += [
-        "", f"two processes over one: {ratio:.2f} times the episodes/s (target {_TARGET_RATIO})",
-        f"memory of two workers and the driver: {peak_gb:.2f} GB at most (target {_TARGET_GB:g})",
-        f"killed after {killed.measured} episodes; the second call measured {again.measured}, {lost} twice",
-    ]  # fmt: skip
+        took = (f"{each.end_s - each.begin_s:.0f}", f"{each.rate:.3f}", f"{each.cpu_s / max(each.measured, 1):.2f}")
+        lines.append([name, each.measured, *took, f"{each.peak_gb:.2f}"])
+    head = ("call", "episodes", "took, s", "episodes/s", "processor time, s/episode", "memory, GB")
+    report.say(kit.table(head, lines))
     if "Ray" in calls:
         stored = sorted(calls["Ray"].stored_s)
-        alone = [at for at in stored if at < joined_s]
-        both = [at for at in stored if at > joined_s]
+        alone, both = [at for at in stored if at < joined_s], [at for at in stored if at > joined_s]
         rates = [(len(part) - 1) / (part[-1] - part[0]) if len(part) > 1 else float("nan") for part in (alone, both)]
         per = [1e3 / calls[name].rate for name in ("two, nothing", "Ray, nothing")]
-        lines += [
+        report.say(
             f"Ray: {rates[0]:.3f} episodes/s on one node, {rates[1]:.3f} on two; by processes {again.rate:.3f}",
             f"an episode that fails at once: {per[0]:.1f} ms with processes, {per[1]:.1f} ms with Ray",
-            f"tables by processes with a kill and by Ray: {'the same to the byte' if same else 'DIFFERENT'}",
-        ]  # fmt: skip
-    lines.append(
+        )
+    report.say(
         f"driver, {end['rows']:.0f} rows: {end['store_ms']:.2f} ms to store one, {end['end_ms']:.2f} ms each at the "
         f"end (table, mountings, report), {end['end_kb_per_row']:.1f} kB of memory each; "
         f"{end['file_kb']:.0f} kB a file, {end['table_kb']:.0f} kB of table"
     )
-    return "\n".join(lines), good
+    ratio, peak_gb = again.rate / one.rate, max(killed.peak_gb, again.peak_gb)
+    lost = killed.measured + again.measured - episodes
+    report.reach(
+        [
+            (f"two processes over one: at least {_TARGET_RATIO} times the episodes/s", f"{ratio:.2f} times",
+             ratio >= _TARGET_RATIO),
+            (f"memory of two workers and the driver: at most {_TARGET_GB:g} GB", f"{peak_gb:.2f} GB",
+             peak_gb <= _TARGET_GB),
+            (f"killed after {killed.measured} episodes, the second call measured the rest",
+             f"{again.measured}, {lost} twice", lost == 0),
+            ("tables by processes with a kill and by Ray are the same to the byte",
+             {True: "yes", False: "DIFFERENT", None: "no Ray"}[same], same),
+        ]
+    )  # fmt: skip

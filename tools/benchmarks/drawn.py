@@ -1,21 +1,25 @@
-"""What every benchmark draws alike for its scenes: lenses, places at which the gripper is in view, looks, references.
+"""What every benchmark draws alike for its scenes: lenses, places at which the gripper is in view, looks, references;
+and the words in which conditions are written down.
 
 Each benchmark names its own ranges.  The order of the draws is part of a scene: seeds name the same scenes for good.
+A condition's changes are sections of the scenario by name, each a value or a draw, a function of the draft.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings
-from gripmon.model.geometry import make_transform, perturb
-from gripmon.model.records import Array
+from gripmon.model.geometry import make_transform, perturb, to_record
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.simulate import PAPER_LENS
-from gripmon.simulate.scenario import FingerLook, Sensor
+from gripmon.simulate.scenario import Background, FingerLook, Sensor
 
 Rng = np.random.Generator
 
@@ -40,6 +44,76 @@ def lenses() -> dict[str, LensSettings]:
             coefficients=(0.03, -0.02, 0.004, 0.0),
         ),
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What is drawn for a scene before its condition: the generator, length, opening and the look of things."""
+
+    rng: Rng
+    frames: int
+    opening_m: float
+    background: Background
+    fingers: FingerLook
+    sensor: Sensor
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def sign(self) -> float:
+        return float(self.rng.choice((-1.0, 1.0)))
+
+    def chance(self, probability: float) -> bool:
+        return bool(self.rng.random() < probability)
+
+    def one_of(self, *values: Any) -> Any:
+        return values[int(self.rng.integers(len(values)))]
+
+
+Changes = dict[str, Any]
+"""Sections of a scenario by name; draws among them."""
+Draw = Callable[[Any], Any]
+"""Of a draft."""
+
+
+def drawn(draft: Draft, value: Any) -> Any:
+    """A value, what a draw gives, or these in dictionaries and tuples, in their order."""
+    if isinstance(value, dict):
+        return {name: drawn(draft, inner) for name, inner in value.items()}
+    if isinstance(value, tuple):
+        return tuple(drawn(draft, inner) for inner in value)
+    return value(draft) if callable(value) else value
+
+
+def uniform(low: float, high: float) -> Draw:
+    return lambda draft: draft.uniform(low, high)
+
+
+def either_way(low: float, high: float) -> Draw:
+    """Of either sign."""
+    return lambda draft: draft.sign() * draft.uniform(low, high)
+
+
+def whole(low: int, end: int) -> Draw:
+    return lambda draft: int(draft.rng.integers(low, end))
+
+
+def one_of(*values: Any) -> Draw:
+    return lambda draft: draft.one_of(*values)
+
+
+def make(kind: Any, **fields: Any) -> Draw:
+    """A new section, or a part of one."""
+    return lambda draft: kind(**drawn(draft, fields))
+
+
+def change(section: str, **fields: Any) -> Draw:
+    """The draft's section with other values."""
+    return lambda draft: with_(getattr(draft, section), **drawn(draft, fields))
+
+
+def with_(settings: Any, **changes: Any) -> Any:
+    return msgspec.structs.replace(settings, **changes)
 
 
 class Place(NamedTuple):
@@ -86,3 +160,9 @@ def sensor(rng: Rng) -> Sensor:
 def reference(rng: Rng, cam_T_grip: Array) -> Array:
     """A calibration (4, 4) that is off by :data:`REFERENCE_SIGMA`."""
     return perturb(cam_T_grip, rng.normal(0.0, REFERENCE_SIGMA))
+
+
+def reference_record(cam_T_grip: Array, covariance: Array | None = None, revision: int = 1) -> ReferenceRecord:
+    """What a monitor starts from: a calibration, and its covariance (6, 6); that of :func:`reference` for None."""
+    own = np.diag(REFERENCE_SIGMA**2) if covariance is None else covariance
+    return ReferenceRecord("start", revision, 0, "configuration", to_record(cam_T_grip), tuple(own.ravel().tolist()))

@@ -120,9 +120,8 @@ class Subscriber:
         self.arrivals_ns = np.zeros(0, np.int64)
         pinned_to = os.sched_getaffinity(0)
         os.sched_setaffinity(0, (_CORES - pinned_to) or _CORES)  # for the new process, which takes it over
-        self._process = subprocess.Popen(
-            [sys.executable, str(_SUBSCRIBER), endpoint, key], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        command = [sys.executable, str(_SUBSCRIBER), endpoint, key, "note"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         os.sched_setaffinity(0, pinned_to)
         assert self._process.stdout is not None
         if self._process.stdout.readline() != "ready\n":
@@ -135,12 +134,17 @@ class Subscriber:
         self.seqs, self.arrivals_ns = (np.array(received[k], np.int64) for k in ("seqs", "arrivals_ns"))
 
 
+def free_endpoint() -> str:
+    """A Zenoh endpoint on a loopback port that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
 @contextmanager
 def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
     """A publisher on a free loopback port with a subscriber in another process."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     link = Link(PublishSettings(listen=(endpoint,)))
     publisher = ZenohPublisher(link, config.settings.robot, config.settings.camera_name)
     try:

@@ -5,35 +5,35 @@ What fixes the motion along the fingers are the tips alone; most of these offer 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from benchmarks.drawn import Changes, Draw, with_
 from benchmarks.integrity_conditions import MOVED, ORDINARY, bump
-from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, both, with_
+from benchmarks.integrity_scenes import Condition, Fingers, SceneDraft, both
 from gripmon.simulate.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
 
 _COMES, _GOES = 0.12, 0.88  # shares of the time at which what comes is there, and leaves again
 
 
-def grasp(draft: Draft) -> Changes:
+def grasp(draft: SceneDraft) -> Changes:
     """An object of any size comes, the jaws close on it, hold it, open, and it goes; the tips' near edges stay free."""
     return _held(draft, draft.uniform(0.5, 1.05) * draft.thick_m, draft.uniform(0.02, 0.05), _look(draft))
 
 
-def grasp_lines(draft: Draft) -> Changes:
+def grasp_lines(draft: SceneDraft) -> Changes:
     """The object has lines along the fingers, or along the tips, or a fold."""
     pattern = draft.one_of("lines_along_fingers", "lines_along_tips", "fold")
     look = with_(_look(draft), pattern=pattern, pitch_m=draft.uniform(0.003, 0.012))
     return _held(draft, draft.uniform(0.5, 1.6) * draft.thick_m, draft.uniform(0.02, 0.05), look)
 
 
-def long_bar(draft: Draft) -> Changes:
+def long_bar(draft: SceneDraft) -> Changes:
     """A bar that reaches far beyond the fingers on both sides, its borders parallel to the tips' inner edges."""
     return _held(draft, draft.uniform(0.08, 0.2), draft.uniform(0.006, 0.03), _look(draft))
 
 
-def thin_plate(draft: Draft) -> Changes:
+def thin_plate(draft: SceneDraft) -> Changes:
     """A thin plate on edge between the fingers."""
     changes = _held(draft, draft.uniform(0.03, 0.15), draft.uniform(0.02, 0.06), _look(draft))
     width_m = draft.uniform(0.002, 0.005)
@@ -44,7 +44,7 @@ def thin_plate(draft: Draft) -> Changes:
     }
 
 
-def _held(draft: Draft, thick_m: float, long_m: float, look: ObjectLook) -> Changes:
+def _held(draft: SceneDraft, thick_m: float, long_m: float, look: ObjectLook) -> Changes:
     width_m = max(draft.opening_m - draft.uniform(0.003, 0.014), 0.004, draft.gripper.jaw_min_m)
     grasped = GraspedObject(
         size_m=(width_m, thick_m, long_m),
@@ -57,13 +57,13 @@ def _held(draft: Draft, thick_m: float, long_m: float, look: ObjectLook) -> Chan
     return {"grasped": grasped, "jaw": _closing(draft, width_m)}
 
 
-def _closing(draft: Draft, width_m: float) -> JawScript:
+def _closing(draft: SceneDraft, width_m: float) -> JawScript:
     """Jaws that close to a width while something is there, and open again."""
     knots = ((0.13, draft.opening_m), (0.24, width_m), (0.76, width_m), (0.87, draft.opening_m))
     return with_(draft.jaw, knots=tuple((draft.at_s(share), opening_m) for share, opening_m in knots))
 
 
-def _look(draft: Draft) -> ObjectLook:
+def _look(draft: SceneDraft) -> ObjectLook:
     return ObjectLook(
         pattern=draft.one_of("printed", "plain", "plain", "lines_along_fingers", "lines_along_tips", "fold"),
         level_dn=draft.uniform(30.0, 220.0),
@@ -72,7 +72,7 @@ def _look(draft: Draft) -> ObjectLook:
     )
 
 
-def _prop(draft: Draft, **settings: Any) -> Prop:
+def _prop(draft: SceneDraft, **settings: Any) -> Prop:
     """Something that comes from the side or from afar, slowly or at once, and goes again."""
     from_m = draft.one_of((0.15, 0.0, 0.0), (-0.15, 0.0, 0.0), (0.0, 0.0, 0.12))
     move_s = 0.0 if draft.chance(0.2) else _COMES * (draft.end_s - draft.start_s)
@@ -80,7 +80,7 @@ def _prop(draft: Draft, **settings: Any) -> Prop:
     return Prop(**{**times, "look": _look(draft), **settings})
 
 
-def _swaying(draft: Draft) -> dict[str, Any]:
+def _swaying(draft: SceneDraft) -> dict[str, Any]:
     """Half of the things beside the tips move along the fingers or towards the camera."""
     if draft.chance(0.5):
         return {}
@@ -90,7 +90,7 @@ def _swaying(draft: Draft) -> dict[str, Any]:
     }
 
 
-def rim_beside(draft: Draft) -> Changes:
+def rim_beside(draft: SceneDraft) -> Changes:
     """A bar or rim beyond the tips, parallel to them, that hides nothing."""
     size = (draft.uniform(0.1, 0.25), draft.uniform(0.002, 0.015), draft.uniform(0.002, 0.02))
     z_m = float(draft.tip_high_m[2]) + 0.5 * size[2] + draft.uniform(0.001, 0.02)
@@ -99,7 +99,7 @@ def rim_beside(draft: Draft) -> Changes:
     return {"props": (_prop(draft, size_m=size, centre_m=centre, **sway),)}
 
 
-def rim_over_tips(draft: Draft) -> Changes:
+def rim_over_tips(draft: SceneDraft) -> Changes:
     """A bar between camera and tips, parallel to them: it hides both, and its borders stand in for them."""
     size = (draft.uniform(0.15, 0.25), draft.uniform(0.003, 0.015), draft.uniform(0.012, 0.04))
     gap_m = draft.uniform(0.001, 0.01)
@@ -110,7 +110,7 @@ def rim_over_tips(draft: Draft) -> Changes:
     return {"props": (_prop(draft, size_m=size, centre_m=centre, from_m=from_m, **sway),)}
 
 
-def box_over_one(draft: Draft) -> Changes:
+def box_over_one(draft: SceneDraft) -> Changes:
     """A box or plate between camera and one of the fingers' tips, its borders parallel to the finger's."""
     side = draft.sign()
     outer_m = float(draft.tip_high_m[0])
@@ -124,7 +124,7 @@ def box_over_one(draft: Draft) -> Changes:
     return {"props": (_prop(draft, size_m=size, centre_m=centre, from_m=(side * 0.15, 0.0, 0.0)),)}
 
 
-def big_grasp(draft: Draft) -> Changes:
+def big_grasp(draft: SceneDraft) -> Changes:
     """What is held reaches around the tips: its front hides both of them."""
     held = grasp(draft)
     width_m = 2.0 * float(draft.tip_high_m[0]) + draft.uniform(0.0, 0.04)
@@ -135,7 +135,7 @@ def big_grasp(draft: Draft) -> Changes:
     return {**held, "props": (with_(front, move_s=_COMES * (draft.end_s - draft.start_s)),)}
 
 
-def plate_behind(draft: Draft) -> Changes:
+def plate_behind(draft: SceneDraft) -> Changes:
     """A plate with lines along the fingers, or along the tips, fills the background."""
     pattern = draft.one_of("lines_along_fingers", "lines_along_tips")
     look = with_(_look(draft), pattern=pattern)
@@ -146,7 +146,7 @@ def plate_behind(draft: Draft) -> Changes:
     return {"props": (with_(plate, from_m=(0.0, 0.0, 0.3)),)}
 
 
-def copies(draft: Draft) -> Changes:
+def copies(draft: SceneDraft) -> Changes:
     """Copies of the fingers' outlines beside them or beyond, that move or stand still."""
     outer_m = 2.0 * float(draft.tip_high_m[0])
     shift = (
@@ -157,13 +157,13 @@ def copies(draft: Draft) -> Changes:
     return {"props": (_prop(draft, shape="fingers", centre_m=shift, **_swaying(draft)),)}
 
 
-def mirror(draft: Draft) -> Changes:
+def mirror(draft: SceneDraft) -> Changes:
     """A glossy table beyond the tips shows the fingers upside down."""
     z_m = float(draft.tip_high_m[2]) + draft.uniform(0.001, 0.02)
     return {"props": (_prop(draft, shape="mirrored_fingers", centre_m=(0.0, 0.0, z_m), from_m=(0.0, 0.0, 0.1)),)}
 
 
-def cables(draft: Draft) -> Changes:
+def cables(draft: SceneDraft) -> Changes:
     """One to three cables hang between camera and fingers."""
     props = []
     for _ in range(int(draft.rng.integers(1, 4))):
@@ -177,7 +177,7 @@ def cables(draft: Draft) -> Changes:
     return {"props": tuple(props)}
 
 
-def shadow_lines(draft: Draft) -> Changes:
+def shadow_lines(draft: SceneDraft) -> Changes:
     """Shadows whose sharp borders run parallel to the tips pass slowly, or stand still."""
     shadows = tuple(
         Shadow(
@@ -194,7 +194,7 @@ def shadow_lines(draft: Draft) -> Changes:
     return {"light": Light(shadows=shadows)}
 
 
-def misleading_run(draft: Draft) -> Changes:
+def misleading_run(draft: SceneDraft) -> Changes:
     """Some frames show lines where the tips were, from one frame to the next; then the view is free."""
     shown = draft.one_of(rim_over_tips, box_over_one, _plate_over_all)(draft)["props"][0]
     start_s = draft.between_frames_s(draft.uniform(0.1, 0.3))
@@ -202,7 +202,7 @@ def misleading_run(draft: Draft) -> Changes:
     return {"props": (with_(shown, start_s=start_s, end_s=end_s, move_s=0.0),)}
 
 
-def _plate_over_all(draft: Draft) -> Changes:
+def _plate_over_all(draft: SceneDraft) -> Changes:
     """A plate with lines between camera and fingers."""
     pattern = draft.one_of("lines_along_fingers", "lines_along_tips", "fold", "printed")
     look = with_(_look(draft), pattern=pattern)
@@ -210,7 +210,7 @@ def _plate_over_all(draft: Draft) -> Changes:
     return {"props": (_prop(draft, size_m=(0.3, 0.002, 0.2), centre_m=centre, look=look),)}
 
 
-def _together(*choices: Callable[[Draft], Changes]) -> Callable[[Draft], Changes]:
+def _together(*choices: Draw) -> Draw:
     """One of several changes."""
     return lambda draft: draft.one_of(*choices)(draft)
 

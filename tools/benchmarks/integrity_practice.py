@@ -9,21 +9,22 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks import padded
+from benchmarks.drawn import Changes, change, with_
 from benchmarks.integrity_conditions import MOVED, ORDINARY
-from benchmarks.integrity_draft import Changes, Condition, Draft, Fingers, with_
 from benchmarks.integrity_misleading import MISLEADING, OTHER_FINGERS
+from benchmarks.integrity_scenes import Condition, Fingers, SceneDraft
 from gripmon.simulate.scenario import Bump, GraspedObject, JawScript, LampChange, Light, LightStep, ObjectLook
 
 KNOCK_M, KNOCK_DEG, GRASPED_M = 2e-3, 0.55, 0.026
 _JAW_NOISE_M = 2e-5
 
 
-def lamp(draft: Draft) -> Changes:
+def lamp(draft: SceneDraft) -> Changes:
     """The lamp moves to the other side, within up to a second, and back; the light's strength changes with it."""
     return _lamp(draft, (0.1, 0.6))
 
 
-def _lamp(draft: Draft, shares: tuple[float, ...], factors: tuple[float, ...] = ()) -> Changes:
+def _lamp(draft: SceneDraft, shares: tuple[float, ...], factors: tuple[float, ...] = ()) -> Changes:
     changes, steps = [], []
     side = -float(np.sign(draft.fingers.lamp_cam[0]))
     for k, share in enumerate(shares):
@@ -37,12 +38,7 @@ def _lamp(draft: Draft, shares: tuple[float, ...], factors: tuple[float, ...] = 
     return {"fingers": fingers, "light": Light(steps=tuple(steps))}
 
 
-def srgb(draft: Draft) -> Changes:
-    """A colour camera's grey levels, which the configuration says."""
-    return {"sensor": with_(draft.sensor, response="srgb")}
-
-
-def auto_exposure(draft: Draft) -> Changes:
+def auto_exposure(draft: SceneDraft) -> Changes:
     """The camera follows steps of the light by up to four times within some frames to a second, and hunts."""
     steps = tuple(
         LightStep(at_s=draft.between_frames_s(share), factor=float(np.exp(draft.sign() * draft.uniform(0.5, 1.4))))
@@ -59,12 +55,12 @@ def auto_exposure(draft: Draft) -> Changes:
     }
 
 
-def short(draft: Draft) -> Changes:
+def short(draft: SceneDraft) -> Changes:
     """The image's border leaves some 25 px of the fingers; under automatic exposure."""
     return auto_exposure(draft) | {"fingers": with_(draft.fingers, carriers=False)}
 
 
-def pads(draft: Draft) -> Changes:
+def pads(draft: SceneDraft) -> Changes:
     """Aluminium with black pads before a colour camera."""
     return {
         "fingers": with_(
@@ -75,7 +71,7 @@ def pads(draft: Draft) -> Changes:
     }
 
 
-def pads_at_work(draft: Draft) -> Changes:
+def pads_at_work(draft: SceneDraft) -> Changes:
     """The light drops to 45 % and comes from the side, a box is grasped, a knock of 2 mm and 0.55 degrees, more light:
     at the times of 180 frames at 15 a second.
     """
@@ -112,7 +108,7 @@ def pads_at_work(draft: Draft) -> Changes:
 
 PRACTICE: tuple[Condition, ...] = (
     Condition("lamp", "the lamp changes its side", lamp),
-    Condition("srgb", "a colour camera's grey levels, declared", srgb),
+    Condition("srgb", "a colour camera's grey levels, declared", {"sensor": change("sensor", response="srgb")}),
     Condition("auto exposure", "a colour camera's exposure follows steps of the light, and hunts", auto_exposure),
     Condition("25 px", "25 px of the fingers are seen, automatic exposure", short, fingers=Fingers.SHORT),
     Condition("pads", "tapered fingers with black pads, a colour camera", pads, fingers=Fingers.PADDED),

@@ -17,10 +17,10 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import rendered
-from benchmarks.integrity_draft import Fingers
+from benchmarks.drawn import reference_record
 from benchmarks.integrity_limits import AlertLimits, frozen_limits
 from benchmarks.integrity_practice import CONDITIONS
-from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
+from benchmarks.integrity_scenes import Fingers, IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.outline_seen import outline_seen
 from benchmarks.rendered import Rendered
@@ -28,7 +28,7 @@ from gripmon.belief.core import Believed
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy.judging import NO_REFERENCE
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, perturb, perturbation_between, rotation_angle, to_record
+from gripmon.model.geometry import from_record, perturb, perturbation_between, rotation_angle
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     Alert,
@@ -39,7 +39,6 @@ from gripmon.model.records import (
     Frame,
     FrameRecord,
     Origin,
-    ReferenceRecord,
     ValidBy,
     Verdict,
 )
@@ -127,9 +126,8 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
     if valid_by not in ("", BELIEF):
         policy = msgspec.structs.replace(settings.policy, valid_by=msgspec.convert(valid_by, ValidBy))
         settings = msgspec.structs.replace(settings, policy=policy)
-    monitor = Monitor(
-        watched.camera, watched.gripper, settings, _reference(watched), None, shadow=valid_by == BELIEF
-    )
+    start = reference_record(watched.start_cam_T_grip, watched.start_covariance, 0)
+    monitor = Monitor(watched.camera, watched.gripper, settings, start, None, shadow=valid_by == BELIEF)
     truth = Truth(watched.start_cam_T_grip, watched.true_start_cam_T_grip)
     rows: list[dict[str, Any]] = []
     alerts: list[list[Any]] = []
@@ -311,11 +309,6 @@ def _settings(watched: Watched) -> MonitorSettings:
         settings.policy, alert_limit_m=limits.position_m, alert_limit_rad=limits.rotation_rad
     )
     return msgspec.structs.replace(settings, policy=policy)
-
-
-def _reference(watched: Watched) -> ReferenceRecord:
-    covariance = tuple(watched.start_covariance.ravel().tolist())
-    return ReferenceRecord("start", 0, 0, "configuration", to_record(watched.start_cam_T_grip), covariance)
 
 
 def _simulated(scene: IntegrityScene) -> Watched:

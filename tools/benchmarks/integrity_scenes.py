@@ -6,22 +6,32 @@ Every scene is a pure function of the condition's name, the seed, the scene's nu
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from benchmarks import drawn, padded
-from benchmarks.drawn import Place, finger_look, in_view
+from benchmarks import padded
+from benchmarks.drawn import (
+    REFERENCE_SIGMA,
+    Changes,
+    Draft,
+    Draw,
+    Place,
+    drawn,
+    finger_look,
+    in_view,
+    reference,
+)
 from benchmarks.fingers import first_finger, gripper_models, gripper_of
-from benchmarks.integrity_draft import Condition, Draft, Fingers
 from benchmarks.rounded import rounded_model, rounded_solids
 from gripmon.model.camera import Camera, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array
+from gripmon.model.records import Array, Cause
 from gripmon.simulate import PAPER_LENS, Rig, Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerMark, JawScript, Sensor
 
@@ -36,6 +46,88 @@ SHORT_PX = (20.0, 30.0)
 _INSIDE_AT = (0.3, 0.6)
 _KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
 _JAW_NOISE_M = 3e-5
+
+
+@dataclass(frozen=True)
+class SceneDraft(Draft):
+    """And between which times things happen, ``start_s`` and ``end_s``: before and after, the gripper is free."""
+
+    fps: float
+    start_s: float
+    end_s: float
+    gripper: Gripper
+    cam_T_grip: Array
+    jaw: JawScript
+
+    def at_s(self, share: float) -> float:
+        """A time between start and end."""
+        return self.start_s + share * (self.end_s - self.start_s)
+
+    def between_frames_s(self, share: float) -> float:
+        """Near a share of the time, between two frames: a jump there is in no frame's exposure."""
+        return (round(self.at_s(share) * self.fps) + 0.5) / self.fps
+
+    @property
+    def tip_low_m(self) -> Array:
+        """Smallest x, y, z (3,) of all tips' corners at the drawn opening: y is the side towards the camera."""
+        return np.asarray(self._tips_m.min(axis=0))
+
+    @property
+    def tip_high_m(self) -> Array:
+        """Largest x, y, z (3,) of all tips' corners at the drawn opening."""
+        return np.asarray(self._tips_m.max(axis=0))
+
+    @property
+    def thick_m(self) -> float:
+        """Extent of the tips along y."""
+        return float(self.tip_high_m[1] - self.tip_low_m[1])
+
+    @property
+    def _tips_m(self) -> Array:
+        return self.gripper.points_grip_m(self.opening_m)[self.gripper.corner_points]
+
+
+class Fingers(Enum):
+    """Which grippers: the usual ones; two fingers with rounded tips; one finger of the usual that stands still; the
+    usual, of which the image's border leaves 25 px; tapered fingers with pads before a colour camera.
+    """
+
+    USUAL = ""
+    ROUND_TIPS = "round tips"
+    ONE = "one finger"
+    SHORT = "25 px"
+    PADDED = "pads"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A kind of scene.
+
+    ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``wrong``:
+    what is wrong, so that an alert which names it is true; ``inside``: a scene may begin in the midst of it;
+    ``truth``: what the true gripper is instead of the one that the monitor knows; ``fingers``: of which grippers.
+    """
+
+    name: str
+    what: str
+    changes: Changes | Draw = field(default_factory=dict)
+    enough: bool = True
+    wrong: tuple[Cause, ...] = ()
+    inside: bool = True
+    truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
+    fingers: Fingers = Fingers.USUAL
+
+
+def both(*parts: Draw) -> Draw:
+    """Several changes together; a later one wins where they meet."""
+
+    def changes(draft: SceneDraft) -> Changes:
+        out: Changes = {}
+        for part in parts:
+            out |= drawn(draft, part)
+        return out
+
+    return changes
 
 
 @dataclass(frozen=True)
@@ -79,8 +171,8 @@ def make_integrity_scene(condition: Condition, seed: int, number: int, frames: i
         condition=condition,
         simulator=simulator,
         gripper=gripper,
-        start_cam_T_grip=drawn.reference(rng, simulator.truth(first).cam_T_grip),
-        start_covariance=np.diag(drawn.REFERENCE_SIGMA**2),
+        start_cam_T_grip=reference(rng, simulator.truth(first).cam_T_grip),
+        start_covariance=np.diag(REFERENCE_SIGMA**2),
         jaw_sigma_m=0.0 if scenario.jaw.reported_noise_m == 0.0 and not scenario.jaw.reported_offset_m else None,
         first=first,
         frames=frames,
@@ -106,7 +198,7 @@ def _round_tipped(rng: np.random.Generator) -> tuple[Gripper, Gripper]:
     return rounded_model(width_m, radius_m), rounded_solids(width_m, radius_m)
 
 
-def _scenario(condition: Condition, draft: Draft) -> Scenario:
+def _scenario(condition: Condition, draft: SceneDraft) -> Scenario:
     """An ordinary scene with the condition's changes."""
     sections: dict[str, Any] = {
         "name": condition.name,
@@ -117,10 +209,10 @@ def _scenario(condition: Condition, draft: Draft) -> Scenario:
         "sensor": draft.sensor,
         "jaw": draft.jaw,
     }
-    return Scenario(**{**sections, **condition.changes(draft)})
+    return Scenario(**{**sections, **drawn(draft, condition.changes)})
 
 
-def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: Array, opening_m: float) -> Draft:
+def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: Array, opening_m: float) -> SceneDraft:
     """Times and looks of an ordinary scene."""
     fps = float(rng.integers(15, 31))
     lead = int(rng.integers(LEAD_FRAMES[0], LEAD_FRAMES[1] + 1)) if frames >= 60 else max(frames // 4, 1)
@@ -138,7 +230,7 @@ def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: 
         marks=_marks(rng) if rng.random() < MARKED_SHARE else (),
     )
     noise_m = _JAW_NOISE_M if rng.random() < 0.5 else 0.0
-    return Draft(
+    return SceneDraft(
         rng=rng,
         frames=frames,
         fps=fps,

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from benchmarks.integrity_limits import POSITIONS_M
+from benchmarks.kit import at_most, share
 
 BACK_FRAMES = 3
 """Within this many frames after the view is free the transform must be valid."""
@@ -23,7 +23,6 @@ VIEWS = ("nothing hidden", "both tips seen", "one tip hidden", "no tip seen")
 WORST = 10
 SCALES = (0.0, 4.0, 6.0, 8.0, np.inf)
 """Limits between classes of scenes by their image scale at the TCP, px/mm."""
-_CONFIDENCE = 0.95
 NEVER_PROMISED = ("crash",)
 NOT_PROMISED_ABSOLUTE = ("model off", "tips worn", "tips rounded")
 """Conditions that no bound promises to survive, and those of which the absolute one says nothing: a closed list."""
@@ -195,11 +194,6 @@ def promised(line: dict[str, Any]) -> bool:
     return name not in NEVER_PROMISED and not (line["valid_by"] == "absolute" and name in NOT_PROMISED_ABSOLUTE)
 
 
-def upper_bound(events: int, trials: int) -> float:
-    """Exact upper bound (Clopper and Pearson 1934) on a probability, one-sided, for independent trials."""
-    return 1.0 if events >= trials else float(stats.beta.ppf(_CONFIDENCE, events + 1, trials - events))
-
-
 def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
     """Everything that the table shows of some scenes."""
     frames = collect(lines)
@@ -217,9 +211,9 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "scenes": len(lines),
         "frames": count,
         "lies": lies,
-        "lies_at_most": upper_bound(lies, count),
+        "lies_at_most": at_most(lies, count),
         "unbounded": unbounded,
-        "unbounded_at_most": upper_bound(unbounded, count),
+        "unbounded_at_most": at_most(unbounded, count),
         "suspect_unbounded": int(frames.suspect_unbounded.sum()),
         "lies_scenes": _scenes(frames, frames.lies),
         "unbounded_scenes": _scenes(frames, frames.unbounded),
@@ -230,13 +224,13 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
             "lies": int((frames.lies & kept).sum()),
             "unbounded": int((frames.unbounded & kept).sum()),
             "unbounded_scenes": _scenes(frames, frames.unbounded & kept),
-            "unbounded_scenes_at_most": upper_bound(_scenes(frames, frames.unbounded & kept), len(own)),
+            "unbounded_scenes_at_most": at_most(_scenes(frames, frames.unbounded & kept), len(own)),
             "worst_excess": float(kept_excess.max()) if len(kept_excess) else None,
         },
         "beyond_absolute": [int(frames.beyond_absolute.sum()), _scenes(frames, frames.beyond_absolute)],
         "valid_share": float(frames.valid.mean()),
-        "asked_share": _share(frames.valid[frames.asked]),
-        "within": [_share(frames.within[frames.asked, k]) for k in range(len(POSITIONS_M))],
+        "asked_share": share(frames.valid[frames.asked]),
+        "within": [share(frames.within[frames.asked, k]) for k in range(len(POSITIONS_M))],
         "median_both_m": [_median(frames.both_m[frames.valid, k]) for k in range(2)],
         "first_valid": float(np.median(firsts)),
         "never_valid": int(np.isinf(firsts).sum()),
@@ -245,8 +239,8 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "knock_found": _median(np.array([knock.found for knock in knocks])),
         "knock_valid": _median(np.array([knock.valid for knock in knocks])),
         "misleading_scenes": len(set(frames.line[frames.lies | frames.unbounded].tolist())),
-        "available": [_share(frames.valid[frames.asked & (frames.view == view)]) for view in range(4)],
-        "possible": [_share(frames.possible[frames.asked & (frames.view == view)]) for view in range(4)],
+        "available": [share(frames.valid[frames.asked & (frames.view == view)]) for view in range(4)],
+        "possible": [share(frames.possible[frames.asked & (frames.view == view)]) for view in range(4)],
         "asked": [int((frames.asked & (frames.view == view)).sum()) for view in range(4)],
         "median_error_m": error,
         "median_level_m": level,
@@ -254,7 +248,7 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "nees": float(nees.mean()) if len(nees) else None,
         "median_nees": float(np.median(nees)) if len(nees) else None,
         "freed": len(frames.back),
-        "back": _share(frames.back <= BACK_FRAMES),
+        "back": share(frames.back <= BACK_FRAMES),
         "latest_back": float(frames.back.max()) if len(frames.back) else None,
         "false_alerts": sum(len(line["false_alerts"]) for line in lines),
         "alert_scenes": sum(bool(line["false_alerts"]) for line in lines),
@@ -273,6 +267,19 @@ def _median(values: NDArray[np.float64]) -> float | None:
     return float(np.median(there)) if len(there) else None
 
 
+def by_condition(lines: list[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Scenes of each condition, and all of them."""
+    names = dict.fromkeys(line["condition"] for line in lines)
+    return [*((name, [line for line in lines if line["condition"] == name]) for name in names), ("all", lines)]
+
+
+def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of each condition, of all, and by scale; the worst frames."""
+    *own, (_, every) = by_condition(lines)
+    rows = {name: figures(of) for name, of in own}
+    return {"rows": rows, "total": figures(every), "scales": by_scale(lines), "worst": worst(lines)}
+
+
 def by_scale(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Figures of scenes by how large the fingertips are in the image, and by what is known of the jaw opening."""
     out = []
@@ -286,10 +293,6 @@ def by_scale(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _px_per_mm(line: dict[str, Any]) -> float:
     return 1e-3 * float(line["focal_px"]) / float(line["depth_m"])
-
-
-def _share(what: NDArray[np.bool_]) -> float | None:
-    return float(what.mean()) if len(what) else None
 
 
 def worst(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -325,7 +328,7 @@ def worst(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:
     """Each target, what was reached, and whether it is met (None: nothing to judge it by)."""
 
-    def share(value: float | None) -> str:
+    def reached(value: float | None) -> str:
         return "–" if value is None else f"{100.0 * value:.2f} %"
 
     kept = total["promised"]
@@ -343,9 +346,9 @@ def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:
         ),
     ]
     for view, least in enumerate(AVAILABLE):
-        reached = total["available"][view]
-        met = None if reached is None else reached >= least
-        out.append((f"valid where {VIEWS[view]}: at least {100.0 * least:g} %", share(reached), met))
+        available = total["available"][view]
+        met = None if available is None else available >= least
+        out.append((f"valid where {VIEWS[view]}: at least {100.0 * least:g} %", reached(available), met))
     ratio, nees, back = total["level_over_error"], total["nees"], total["back"]
     out += [
         (
@@ -355,7 +358,7 @@ def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:
         ),
         (
             f"valid again within {BACK_FRAMES} frames: at least {100.0 * BACK_SHARE:g} %",
-            f"{share(back)} of {total['freed']}",
+            f"{reached(back)} of {total['freed']}",
             None if back is None else back >= BACK_SHARE,
         ),
         (

@@ -20,9 +20,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import machine
-from benchmarks.revision import checkout_of, commit_of
-from benchmarks.rings import Rings
+from benchmarks import kit, machine
+from benchmarks.kit import Report
+from benchmarks.machine import checkout_of, commit_of
+from benchmarks.parts import Frames, Rings
 
 _SIDE = Path(__file__).parent / "latency_side.py"
 _LEAST_SIGMAS = 2.0
@@ -40,7 +41,6 @@ class Plan:
     staged: int = 3000
     block: int = 100
     ring: int = 90
-    size: tuple[int, int] = (768, 576)
 
 
 QUICK = Plan(settle=60, frames=1000, staged=600, block=50, ring=16)
@@ -64,6 +64,13 @@ class Compared:
         """By more than the blocks' scatter explains."""
         return self.ratio - _LEAST_SIGMAS * self.ratio_sigma > 1.0
 
+    @property
+    def cells(self) -> list[str]:
+        times = ("–" if np.isnan(us) else f"{us:.1f}" for us in (self.before_us, self.after_us))
+        ratio = "–" if np.isnan(self.ratio) else f"{self.ratio:.3f} ± {self.ratio_sigma:.3f}"
+        high = "–" if np.isnan(self.ratio_p99) else f"{self.ratio_p99:.3f}"
+        return [self.what, *times, ratio, high, "slower" if self.slower else ""]
+
 
 def compared(what: str, before_us: NDArray[np.float64], after_us: NDArray[np.float64], block: int) -> Compared:
     """Of the times (n,) of both sides' frames; block k of one ran beside block k of the other."""
@@ -76,11 +83,15 @@ def compared(what: str, before_us: NDArray[np.float64], after_us: NDArray[np.flo
     return Compared(what, float(np.median(before_us)), float(np.median(after_us)), float(middle), sigma, float(high))
 
 
-def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
-    """The rows, those of the stages last, and what each side was.  ValueError for a revision that git doesn't know."""
-    name, roots = commit_of(revision)[:10], (checkout_of(revision), machine.ROOT)
+def run(revision: str, quick: bool, report: Report) -> None:
+    """Say the rows, those of the stages last.  Refused is a revision that git doesn't know."""
+    plan = QUICK if quick else Plan()
+    try:
+        name, roots = commit_of(revision)[:10], (checkout_of(revision), machine.ROOT)
+    except ValueError as error:
+        raise kit.Refused(f"--against {error}") from None
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
-        ring = Rings(Path(scratch)).of(plan.size, plan.ring)
+        ring = Rings(Path(scratch)).of(Frames(count=plan.ring))
         timed = _alternating(roots, ring, plan.settle, plan.frames, plan.block, staged=False)
         staged = _alternating(roots, ring, plan.settle, plan.staged, plan.block, staged=True)
     rows = [
@@ -91,8 +102,15 @@ def run(revision: str, plan: Plan) -> tuple[list[Compared], dict[str, Any]]:
     for stage in dict.fromkeys(name for side in staged for name in side["stages_us"]):
         before, after = (np.array(side["stages_us"].get(stage, [np.nan] * plan.staged)) for side in staged)
         rows.append(compared(f"stage: {stage}", before, after, plan.block))
-    seen = [{key: side[key] for key in ("measured", "valid")} for side in timed]
-    return rows, {"before": name, "after": machine.commit(), "frames": plan.frames, "seen": seen}
+    about = {"before": name, "after": machine.commit(), "frames": plan.frames}
+    report.values |= {**about, "seen": [{key: side[key] for key in ("measured", "valid")} for side in timed]}
+    report.values["rows"] = rows
+    seen = ", ".join(f"measured {side['measured']}, valid {side['valid']}" for side in timed)
+    report.say(f"{name} → {machine.commit()}: {plan.frames} frames of each, {seen}")
+    head = ("", "before: median, µs", "after", "ratio of medians", "ratio of 99 %", "")
+    report.say(kit.table(head, [row.cells for row in rows]))
+    first = rows[0]
+    report.reach([(f"{first.what}: not slower", f"{first.ratio:.3f} ± {first.ratio_sigma:.3f}", not first.slower)])
 
 
 def _of(sides: list[dict[str, Any]], what: str, key: str, block: int) -> Compared:
@@ -149,20 +167,3 @@ def _until_ready(side: subprocess.Popen[str]) -> dict[str, Any]:
 def _to(side: subprocess.Popen[str]) -> IO[str]:
     assert side.stdin is not None
     return side.stdin
-
-
-def as_lines(rows: list[Compared], about: dict[str, Any]) -> list[str]:
-    """The table on the terminal."""
-    head = f"{'':58}{'median, µs':>12}{'':>12}{'ratio of':>18}{'ratio of':>11}"
-    seen = ", ".join(f"measured {side['measured']}, valid {side['valid']}" for side in about["seen"])
-    lines = [
-        f"{about['before']} → {about['after']}: {about['frames']} frames of each, {seen}",
-        head,
-        f"{'':58}{'before':>12}{'after':>12}{'medians':>18}{'99 %':>11}",
-    ]
-    for row in rows:
-        ratio = "–" if np.isnan(row.ratio) else f"{row.ratio:.3f} ± {row.ratio_sigma:.3f}"
-        high = "–" if np.isnan(row.ratio_p99) else f"{row.ratio_p99:.3f}"
-        cells = "".join("–".rjust(12) if np.isnan(us) else f"{us:12.1f}" for us in (row.before_us, row.after_us))
-        lines.append(f"{row.what:58}{cells}{ratio:>18}{high:>11}{'  slower' if row.slower else ''}")
-    return lines

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks import harness, machine, scene, stages, tags, visp
-from benchmarks.latency_rows import Measured, Row, skipped
+from benchmarks import harness, kit, machine, scene, stages, tags, visp
+from benchmarks.parts import Measured, Row, skipped
 from gripmon.daemon.config import Config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array
@@ -187,16 +187,13 @@ def profile(paths: tuple[Path, ...], plan: Plan) -> Measured:
     """Mean time of each stage, with stop watches in them: of frames that track, and of those that show no gripper."""
     tracking, hidden = (_staged(path, plan, gone=gone) for path, gone in zip(paths, (False, True), strict=True))
     totals_us = [sum(mean_us.values()) for mean_us in (tracking, hidden)]
-    notes = [f"{'mean, µs and share':46}{'tracking':>16}{'gripper hidden':>16}"]
-    for stage in stages.STAGES:
-        cells = (
-            f"{run[stage]:8.0f} {100 * run[stage] / us:5.1f} %"
-            for run, us in zip((tracking, hidden), totals_us, strict=True)
-        )
-        notes.append(f"{stage:46}" + "".join(f"{cell:>16}" for cell in cells))
+    shares = zip((tracking, hidden), totals_us, strict=True)
+    columns = [[f"{run[stage]:.0f}, {100 * run[stage] / us:.1f} %" for stage in stages.STAGES] for run, us in shares]
+    head = ("mean, µs and share", "tracking", "gripper hidden")
+    notes = kit.table(head, zip(stages.STAGES, *columns, strict=True))
     rows = (Row(f"a frame {which}, all stages below", 1e-3 * us, "ms", note="mean, with stop watches")
             for which, us in zip(("while tracking", "without a gripper"), totals_us, strict=True))  # fmt: skip
-    return Measured(tuple(rows), tuple(notes))
+    return Measured(tuple(rows), (notes,))
 
 
 def _staged(path: Path, plan: Plan, *, gone: bool) -> dict[str, float]:

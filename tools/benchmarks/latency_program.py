@@ -24,10 +24,10 @@ import numpy as np
 import yaml
 
 from benchmarks import harness, scene
-from benchmarks.latency_rows import Measured, Row
+from benchmarks.harness import free_endpoint
 from benchmarks.machine import ROOT
+from benchmarks.parts import Measured, Row
 from benchmarks.switched import SwitchedRecorder
-from benchmarks.wire_others import free_endpoint
 from gripmon.io.publish.feeding import FramePublisher
 from gripmon.io.sources import Waiting
 from gripmon.io.sources.realtime import SimulatedCamera

@@ -1,18 +1,21 @@
-"""Where and on what a benchmark ran."""
+"""Where and on what a benchmark ran; another commit beside this checkout, to be measured in the same benchmark."""
 
 from __future__ import annotations
 
 import datetime
 import hashlib
+import io
 import os
 import platform
 import subprocess
+import tarfile
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+_KEPT = ROOT / "build" / "revisions"
 _PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "eclipse-zenoh", "rerun-sdk", "msgspec", "pyapriltags")
 
 
@@ -90,3 +93,32 @@ def digest_of(*patterns: str) -> str:
     for path in sorted({path for pattern in patterns for path in ROOT.glob(pattern)}):
         digest.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes())
     return digest.hexdigest()[:10]
+
+
+def commit_of(revision: str) -> str:
+    """Its full hash.  Raises ValueError for none."""
+    asked = ["git", "rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}"]
+    found = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=False)
+    if found.returncode != 0:
+        raise ValueError(f"{revision}: git knows no such commit here; a hash, a branch or a tag")
+    return found.stdout.strip()
+
+
+def checkout_of(revision: str) -> Path:
+    """A folder with the commit's files, named by its hash; kept, since compiled code is kept beside it.  Raises
+    ValueError for a revision that is none.
+    """
+    commit = commit_of(revision)
+    folder = _KEPT / commit
+    if not folder.exists():
+        packed = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
+        unpacked = _KEPT / f"{commit}.{os.getpid()}"
+        with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+            archive.extractall(unpacked, filter="data")
+        unpacked.rename(folder)
+    return folder
+
+
+def environment(checkout: Path) -> dict[str, str]:
+    """For a process of ``python -P`` whose gripmon is that of a checkout, and whose benchmarks are these."""
+    return {**os.environ, "PYTHONPATH": f"{checkout}{os.pathsep}{ROOT / 'tools'}"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -16,12 +15,12 @@ from benchmarks.integrity_practice import GRASPED_M, PRACTICE
 from benchmarks.integrity_runs import Truth
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.real_images import answered, camera_file
-from benchmarks.shapes import Tracked
+from benchmarks.shapes import Tally, Tracked
 from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
 from gripmon.daemon.calibrations import write_document
 from gripmon.model.geometry import from_record, perturb, to_record
 from gripmon.model.provenance import Provenance
-from gripmon.model.records import Array, Origin, Verdict
+from gripmon.model.records import Array
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import JawScript, Light
 
@@ -118,25 +117,12 @@ def _configuration(folder: Path) -> Path:
 
 
 def _watched(scene: IntegrityScene, config: gripmon.Config) -> Tracked:
-    """Frame after frame, against where the gripper truly is; the first, which none confirms, doesn't count."""
+    """Frame after frame, against where the gripper truly is."""
     monitor, simulator = gripmon.Monitor(config), scene.simulator
     truth = Truth(from_record(config.reference.cam_T_grip), simulator.truth(scene.first).cam_T_grip)
-    errors, counts, why = [], [0, 0, 0], Counter[str]()
+    tally = Tally(config.settings.monitor.policy.alert_limit_m)
     for index in scene.indices:
         record = monitor.process(simulator.frame(index))
         monitor.run_pending()
-        true_T = truth.of(record, simulator.truth(index).cam_T_grip)
-        off_m = float("nan")
-        if record.cam_T_grip is not None:
-            off_m = float(np.linalg.norm(np.array(record.cam_T_grip.translation_m) - true_T[:3, 3]))
-            if record.source is not Origin.HELD:
-                errors.append(off_m)
-        if record.verdict is not Verdict.VALID:
-            why[(record.reason or "").rpartition("excluded that ")[2]] += index > scene.first
-            continue
-        assert record.protection is not None
-        counts[0] += index > scene.first
-        counts[1] += off_m > config.settings.monitor.policy.alert_limit_m
-        counts[2] += off_m > record.protection.position_m
-    commonest = why.most_common(1)[0][0] if why.total() else ""
-    return Tracked(scene.frames - 1, *counts, float(np.median(errors)) if errors else float("nan"), commonest)
+        tally.add(record, truth.of(record, simulator.truth(index).cam_T_grip))
+    return tally.tracked()

@@ -1,268 +1,173 @@
-"""``tools/bench offline``: the off-line calibrations on simulated images, held against the truth.
+"""The off-line calibrations on simulated images, held against the truth.
 
 ``cam_T_grip`` from one image of the gripper on a plate (Plane Coincidence Constraint) in the paper's geometry, with a
-gripper that is known, inferred, and with the camera from the same image; a gripper that doesn't stand on the plate;
-and cameras beside those that other libraries make of the same images.
+gripper that is known, inferred, and with the camera from the same image: error of the tool centre point (TCP) against
+the plate's print, and coverage of the stated covariance; what reveals a gripper that doesn't stand on the plate; and
+cameras beside those that OpenCV and COLMAP make of the same images.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from benchmarks.options import add_command, count, deliver
+import cv2
+import numpy as np
 
-if TYPE_CHECKING:
-    from benchmarks.offline_intrinsics import Fits, Found, Photographs
-    from benchmarks.offline_plane import Errors, Revealed
-    from gripmon.model.targets import Chequerboard
-
-_DESCRIPTION = """\
-Calibrations on simulated images: error of the tool centre point (TCP) by the plane coincidence constraint against the
-plate's print, coverage of the stated covariance, what reveals a gripper that doesn't stand on the plate, and cameras
-beside OpenCV's and COLMAP's from the same images.  Exit code 1 if a target is missed."""
+from benchmarks import kit, offline_intrinsics, offline_plane
+from benchmarks.kit import Report, Target
+from benchmarks.offline_intrinsics import Fits, Found, Photographs
+from benchmarks.offline_plane import Errors, Revealed
+from gripmon.model.targets import Chequerboard
 
 ACROSS_MM, ALONG_MM = 0.02, 0.05
 """Largest error of the TCP across and along the optical axis, with a perfect plate."""
 COVERAGE = (0.92, 0.98)
 """Part of the trials in which the truth is in the stated region of 95 %."""
-_TRIALS, _REVEALED, _SETS, _IMAGES = 100, 40, 10, 12
-_QUICK = (10, 4, 2, 8)
+_FULL, _QUICK = (100, 40, 10, 12), (10, 4, 2, 8)
+"""Images of each kind of plate; of each that reveals a gap; sets of images for a camera, and images of a set."""
 _NO_CLAIM = "single"
 """Its covariance is for principal points that aren't in the middle; in these trials all are."""
+_WAY = {"known": "gripper known", "inferred": "gripper inferred", "single": "known, camera from the same image"}
 
 
-def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
-    parser = add_command(
-        commands,
-        "offline",
-        run,
-        "off-line calibrations against the truth",
-        _DESCRIPTION,
-        quick="a tenth of the trials",
-        as_json="also write the figures",
-        markdown=True,
-    )
-    parser.add_argument("--trials", type=count, metavar="N", help=f"images of each kind of plate (default: {_TRIALS})")
-    parser.add_argument("--seed", type=count, default=1, help="first seed (default: 1)")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quick", action="store_true", help="a tenth of the trials")
+    what = f"images of each kind of plate (default {_FULL[0]})"
+    parser.add_argument("--trials", type=kit.count, metavar="N", help=what)
+    parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="first seed (default 1)")
     parser.add_argument(
         "--photographs", nargs=2, metavar=("FOLDER", "COLUMNSxROWS"), help="also of a chequerboard with so many corners"
     )
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the errors and what reveals a gap")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Handle ``tools/bench offline``."""
-    import cv2
-    from tqdm import tqdm
-
+def run(arguments: argparse.Namespace, report: Report) -> None:
     cv2.setNumThreads(1)
-    try:
-        board = _photographs(arguments.photographs)
-    except ValueError as error:
-        print(f"tools/bench offline: {error}", file=sys.stderr)
-        return 2
-    from benchmarks import offline_intrinsics, offline_plane
-
-    sizes = _QUICK if arguments.quick else (_TRIALS, _REVEALED, _SETS, _IMAGES)
+    board = None if arguments.photographs is None else _board(*arguments.photographs)
+    sizes = _QUICK if arguments.quick else _FULL
     trials, off, sets, images = (arguments.trials or sizes[0], *sizes[1:])
-    with tqdm(total=2 * trials + 4 * off + sets, unit="trial", file=sys.stderr, disable=None) as bar:
-        errors: list[Errors] = []
+    report.say(f"first seed {arguments.seed}")
+    errors: list[Errors] = []
+    with kit.bar("trial", 2 * trials + 4 * off + sets) as bar:
         for print_m in (0.0, offline_plane.PRINT_M):
             errors += offline_plane.trials(trials, arguments.seed, print_m, bar.update)
+        _say_errors(errors, report)
         revealed = offline_plane.revealed(off, arguments.seed, bar.update)
+        _say_revealed(revealed, report)
         fits, found = offline_intrinsics.compare(sets, images, arguments.seed, bar.update)
-        photographs = offline_intrinsics.on_photographs(*board) if board else []
-    faults = missed(errors)
-    text = report(errors, revealed, fits, found, photographs, arguments.seed, faults)
-    deliver(arguments, "offline", text, figures(errors, revealed, fits, found, photographs))
-    if arguments.picture is not None:
-        from benchmarks import offline_plots
+        _say_cameras(fits, found, report)
+    photographs = offline_intrinsics.on_photographs(*board) if board else []
+    if photographs:
+        _say_photographs(photographs, report)
+    report.values |= {
+        "plane": errors, "apart": revealed, "cameras": fits, "found": found, "photographs": photographs,
+    }  # fmt: skip
+    report.reach(targets(errors))
 
-        offline_plots.draw(errors, revealed, arguments.picture)
-    return 1 if faults else 0
 
-
-def _photographs(given: list[str] | None) -> tuple[Path, Chequerboard] | None:
-    """A folder and its board.  Raises ValueError for words that are none."""
-    from gripmon.model.targets import Chequerboard
-
-    if given is None:
-        return None
-    counts = given[1].split("x")
+def _board(folder: str, size: str) -> tuple[Path, Chequerboard]:
+    counts = size.split("x")
     if len(counts) != 2 or not all(count.isdigit() and int(count) > 1 for count in counts):
-        raise ValueError(f"--photographs: {given[1]!r} isn't a board; numbers of inner corners, as 9x6")
-    if not Path(given[0]).is_dir():
-        raise ValueError(f"--photographs: {given[0]} is no folder")
-    return Path(given[0]), Chequerboard(int(counts[0]), int(counts[1]), 0.01)
+        raise kit.Refused(f"--photographs: {size!r} isn't a board; numbers of inner corners, as 9x6")
+    if not Path(folder).is_dir():
+        raise kit.Refused(f"--photographs: {folder} is no folder")
+    return Path(folder), Chequerboard(int(counts[0]), int(counts[1]), 0.01)
 
 
-def missed(errors: list[Errors]) -> list[str]:
-    """What was to be reached and isn't, in words."""
-    import numpy as np
-
-    out = []
+def targets(errors: list[Errors]) -> Iterator[Target]:
+    """Of each kind of plate and way: the largest errors with a perfect plate, and the coverage."""
     for row in errors:
+        name = f"{row.plate} plate, {_WAY[row.way]}"
         if row.way == _NO_CLAIM:
             continue
-        name = f"{row.plate} plate, {_WAY[row.way]}"
         if not row.error:
-            out.append(f"{name}: no result at all")
+            yield Target(f"{name}: a result", "none at all", False)
             continue
         if row.plate == "perfect":
             worst = row.position_mm.max(axis=0)
             for axis, value, limit in zip("xyz", worst, (ACROSS_MM, ACROSS_MM, ALONG_MM), strict=True):
-                if not value <= limit:
-                    out.append(f"{name}: largest error in {axis} {value:.4f} mm; at most {limit:g}")
-        covered = np.round(row.coverage, 3)
-        if not COVERAGE[0] <= covered <= COVERAGE[1]:
-            out.append(f"{name}: the truth is in the region of 95 % in {100 * covered:.0f} %; 92 to 98 %")
-    return out
+                yield Target(f"{name}: largest error in {axis} at most {limit:g} mm", f"{value:.4f} mm", value <= limit)
+        covered = round(row.coverage, 3)
+        what = f"{name}: the truth is in the region of 95 % in 92 to 98 %"
+        yield Target(what, f"{100 * covered:.0f} %", COVERAGE[0] <= covered <= COVERAGE[1])
 
 
-_WAY = {"known": "gripper known", "inferred": "gripper inferred", "single": "known, camera from the same image"}
-
-
-def report(
-    errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found],
-    photographs: list[Photographs], seed: int, faults: list[str],
-) -> str:  # fmt: skip
-    """All tables, and what is missed."""
-    parts = [
-        f"first seed {seed}",
-        _errors_table(errors),
-        _revealed_table(revealed),
-        _fits_table(fits),
-        _found_table(found),
-        *([_photographs_table(photographs)] if photographs else []),
-        "\n".join(f"MISSED: {fault}" for fault in faults) or "every target is reached",
-    ]
-    return "\n\n".join(parts)
-
-
-def _errors_table(errors: list[Errors]) -> str:
-    import numpy as np
-
-    lines = [
-        "TCP error from one image, camera x, y, z (mm); coverage: of the stated region of 95 %",
-        (
-            f"{'plate':<17} {'way':<34} {'mean':>20} {'95 %':>20} {'largest':>20} {'stated sigma':>20} {'NEES/6':>6} "
-            f"{'coverage':>8} {'results':>8}"
-        ),
-    ]
+def _say_errors(errors: list[Errors], report: Report) -> None:
+    lines = []
     for row in errors:
-        total = len(row.error) + len(row.refused)
-        cells = [f"{row.plate:<17} {_WAY[row.way]:<34}"]
+        cells = [f"{row.plate}, {_WAY[row.way]}", *[""] * 6]
         if row.error:
             size = row.position_mm
             claimed = 1e3 * np.mean(row.claimed_m, axis=0)
             columns = (size.mean(axis=0), np.quantile(size, 0.95, axis=0), size.max(axis=0), claimed)
-            cells += [" ".join(f"{v:6.4f}" for v in values) for values in columns]
-            cells.append(f"{np.mean(row.nees) / 6.0:6.2f} {100 * row.coverage:6.0f} %")
-        lines.append(" ".join([*cells, f"{len(row.error):>4}/{total}"]))
-    lines += [f"no result: {reason}" for row in errors for reason in row.refused]
-    return "\n".join(lines)
+            cells[1:5] = [" ".join(f"{v:.4f}" for v in values) for values in columns]
+            cells[5:] = [f"{np.mean(row.nees) / 6.0:.2f}", f"{100 * row.coverage:.0f} %"]
+        lines.append([*cells, f"{len(row.error)}/{len(row.error) + len(row.refused)}"])
+    head = ("plate, way", "mean", "95 %", "largest", "stated sigma", "NEES/6", "coverage", "results")
+    report.say(
+        "TCP error from one image, camera x, y, z (mm); coverage: of the stated region of 95 %", kit.table(head, lines)
+    )
+    refused = [f"no result: {reason}" for row in errors for reason in row.refused]
+    if refused:
+        report.say("\n".join(refused))
 
 
-def _revealed_table(revealed: list[Revealed]) -> str:
-    import numpy as np
-
-    lines = [
-        (
-            "a gripper that doesn't stand on the plate: fraction of images in which it is detected (p below "
-            "0.001); power: of the best test, by all edges and by the corners alone"
-        ),
-        (
-            f"{'':<30} {'noise, DN':>9} {'residuals':>10} {'tilt/gap':>9} {'power':>6} {'corners':>8} "
-            f"{'tilt found x, y (degrees)':>28} "
-            f"{'gap found (mm)':>17} {'TCP off by (mm)':>16}"
-        ),
-    ]
+def _say_revealed(revealed: list[Revealed], report: Report) -> None:
+    lines = []
     for row in revealed:
         if not row.count:
-            lines.append(f"{row.what:<30} {row.noise_dn:>9g} no result")
+            lines.append([row.what, f"{row.noise_dn:g}", "no result"])
             continue
         apart = np.array(row.apart) * [np.degrees(1.0), np.degrees(1.0), 1e3]
-        mean, scatter = apart.mean(axis=0), apart.std(axis=0)
-        tilts = " ".join(f"{m:+.3f} ± {s:.3f}" for m, s in zip(mean[:2], scatter[:2], strict=True))
-        lines.append(
-            f"{row.what:<30} {row.noise_dn:>9g} {100 * row.by_residuals / row.count:>8.0f} % "
-            f"{100 * row.by_apart / row.count:>7.0f} % {100 * np.mean(row.power):>4.0f} % "
-            f"{100 * np.mean(row.corner_power):>6.0f} % {tilts:>28} {mean[2]:>+8.3f} ± {scatter[2]:.3f} "
-            f"{np.mean(row.shift_mm):>16.4f}"
-        )
-    return "\n".join(lines)
+        spread = zip(apart.mean(axis=0), apart.std(axis=0), strict=True)
+        tilt_x, tilt_y, gap = (f"{mean:+.3f} ± {sigma:.3f}" for mean, sigma in spread)
+        shares = (row.by_residuals / row.count, row.by_apart / row.count, np.mean(row.power), np.mean(row.corner_power))
+        cells = (f"{100 * share:.0f} %" for share in shares)
+        off = f"{np.mean(row.shift_mm):.4f}"
+        lines.append([row.what, f"{row.noise_dn:g}", *cells, f"{tilt_x} {tilt_y}", gap, off])
+    head = (
+        "", "noise, DN", "residuals", "tilt/gap", "power", "corners", "tilt found x, y (degrees)", "gap found (mm)",
+        "TCP off by (mm)",
+    )  # fmt: skip
+    report.say(
+        "a gripper that doesn't stand on the plate: fraction of images in which it is detected (p below 0.001); power: "
+        "of the best test, by all edges and by the corners alone",
+        kit.table(head, lines),
+    )
 
 
-def _fits_table(fits: list[Fits]) -> str:
-    import numpy as np
-
-    lines = [
-        "a camera from the same images: root mean square errors (px); mapping: over the image, the best turn allowed",
-        (
-            f"{'':<22} {'fx':>7} {'fy':>7} {'cx':>7} {'cy':>7} {'mapping':>8} {'largest':>8} {'NEES/n':>7} "
-            f"{'seconds':>8} {'failed':>6}"
-        ),
-    ]
+def _say_cameras(fits: list[Fits], found: list[Found], report: Report) -> None:
+    lines = []
     for row in fits:
         if not row.error:
-            lines.append(f"{row.who:<22} no result")
+            lines.append([row.who, "no result"])
             continue
-        rms = np.sqrt(np.mean(np.square(row.error), axis=0))
         mapping = np.array(row.mapping_px)
-        nees = f"{np.mean(row.nees):7.2f}" if row.nees else f"{'-':>7}"
-        lines.append(
-            f"{row.who:<22} {' '.join(f'{v:7.3f}' for v in rms)} {np.sqrt(np.mean(mapping**2)):8.4f} "
-            f"{mapping.max():8.4f} {nees} {np.mean(row.seconds):8.2f} {row.failed:>6}"
-        )
-    return "\n".join(lines)
+        nees = f"{np.mean(row.nees):.2f}" if row.nees else "-"
+        errors = (f"{v:.3f}" for v in kit.rms(row.error, axis=0))
+        mapped = [f"{kit.rms(mapping):.4f}", f"{mapping.max():.4f}"]
+        lines.append([row.who, *errors, *mapped, nees, f"{np.mean(row.seconds):.2f}", row.failed])
+    head = ("", "fx", "fy", "cx", "cy", "mapping", "largest", "NEES/n", "seconds", "failed")
+    report.say(
+        "a camera from the same images: root mean square errors (px); mapping: over the image, the best turn allowed",
+        kit.table(head, lines),
+    )
+    lines = []
+    for each in found:
+        rms = np.sqrt(each.error_px2) if each.error_px2 else np.full(1, np.nan)
+        corners = [f"{np.sqrt(np.mean(rms**2)):.4f}", f"{np.quantile(rms, 0.9):.4f}"]
+        ms = f"{1e3 * each.seconds / max(each.images, 1):.0f}"
+        lines.append([each.who, f"{each.found} of {each.images}", *corners, ms])
+    report.say(
+        "plates found in the same images; root mean square of a corner's error, each axis, and of the worst tenth",
+        kit.table(("", "found", "px", "worst tenth, px", "ms an image"), lines),
+    )
 
 
-def _found_table(found: list[Found]) -> str:
-    import numpy as np
-
-    lines = ["plates found in the same images; root mean square of a corner's error, each axis, and of the worst tenth"]
-    for row in found:
-        each = 1e3 * row.seconds / max(row.images, 1)
-        rms = np.sqrt(row.error_px2) if row.error_px2 else np.full(1, np.nan)
-        lines.append(
-            f"{row.who:<24} {row.found:>4} of {row.images}, {np.sqrt(np.mean(rms**2)):.4f} px, "
-            f"{np.quantile(rms, 0.9):.4f} px, {each:.0f} ms an image"
-        )
-    return "\n".join(lines)
-
-
-def _photographs_table(photographs: list[Photographs]) -> str:
-    lines = ["photographs: what a lens leaves of the corners (root mean square, each axis) where everybody finds them"]
-    lines += [
-        f"{row.who:<24} {row.found:>4} of {row.images}, {row.residual_px:.4f} px in {row.common}" for row in photographs
-    ]
-    return "\n".join(lines)
-
-
-def figures(
-    errors: list[Errors], revealed: list[Revealed], fits: list[Fits], found: list[Found],
-    photographs: list[Photographs],
-) -> dict[str, Any]:  # fmt: skip
-    """Everything, as JSON takes it."""
-    return {
-        "plane": [_plain(row) for row in errors],
-        "apart": [_plain(row) for row in revealed],
-        "cameras": [_plain(row) for row in fits],
-        "found": [_plain(row) for row in found],
-        "photographs": [_plain(row) for row in photographs],
-    }
-
-
-def _plain(row: Any) -> dict[str, Any]:
-    from dataclasses import fields
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, list):
-            return [v.tolist() if hasattr(v, "tolist") else v for v in value]
-        return value
-
-    return {field.name: plain(getattr(row, field.name)) for field in fields(row)}
+def _say_photographs(photographs: list[Photographs], report: Report) -> None:
+    lines = [[p.who, f"{p.found} of {p.images}", f"{p.residual_px:.4f}", p.common] for p in photographs]
+    report.say(
+        "photographs: what a lens leaves of the corners (root mean square, each axis) where everybody finds them",
+        kit.table(("", "found", "px", "in"), lines),
+    )

@@ -1,4 +1,11 @@
-"""``tools/bench real``: stills of real grippers, none of which moved in its camera, at limits fixed beforehand."""
+"""Stills of real grippers, none of which moved in its camera, at limits fixed beforehand.
+
+Stills of real grippers whose camera is screwed on and wasn't knocked: the true motion since the reference is zero in
+each of them.  They are replayed a second apart, untaught, and taught from every other still and judged on those
+between, at alert limits fixed here: what is measured, valid, how large the bounds are, and what contradicts them.
+With --from-images each gripper's file is made of the same images first, by `gripmon gripper from-images`: its words and
+exit code, how far its outline lies beside the one drawn by hand, and the same replays with that file.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +13,20 @@ import argparse
 import math
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
 
-from benchmarks import options
-from benchmarks.machine import ROOT, commit
+import msgspec
+import numpy as np
 
-if TYPE_CHECKING:
-    from benchmarks.real_figures import Figures
-    from benchmarks.real_runs import Limit, Run
-
-_DESCRIPTION = """\
-Stills of real grippers whose camera is screwed on and wasn't knocked: the true motion since the reference is zero in
-each of them.  They are replayed a second apart, untaught, and taught from every other still and judged on those
-between, at alert limits fixed here: what is measured, valid, how large the bounds are, and what contradicts them.
-With --from-images each gripper's file is made of the same images first, by `gripmon gripper from-images`: its words and
-exit code, how far its outline lies beside the one drawn by hand, and the same replays with that file.
-Exit code 1 if a target is missed."""
+from benchmarks import kit
+from benchmarks.kit import Refused, Report
+from benchmarks.machine import ROOT, checkout_of, commit, commit_of, environment
+from benchmarks.real_figures import Figures, figures_of
+from benchmarks.real_runs import BELIEF, CONFIG, Limit, Run, runs_of
+from gripmon import InputError
+from gripmon.model.records import Array
 
 FOLDER = ROOT.parent / "shared" / "data" / "real"
 LIMITS = {"xarm": (5e-3, math.radians(8.0)), "piper": (3e-3, math.radians(6.0))}
@@ -35,26 +37,19 @@ PLAY_M = 0.9e-3
 """Largest play of these fingers: how far a still may really be from where it was."""
 PROPOSED = (0.8, 1.5)
 """``check``'s proposal over the smallest limit within which the bounds of nine of ten stills are (no unit)."""
+_HEAD = (
+    "set", "commit", "bound", "measured", "valid", "median bound, mm, °", "90 % within", "`check` proposes",
+    "scatter x y z, mm", "about x y z, °", "χ² scatter", "χ² motion", "beyond it", "alerts",
+)  # fmt: skip
+
+Found = Sequence[tuple[Run, Figures]]
 
 
-def add_parser(commands: Any) -> None:
-    """Add the benchmark to ``tools/bench``."""
-    parser = options.add_command(
-        commands,
-        "real",
-        run,
-        "stills of real grippers, at fixed limits",
-        _DESCRIPTION,
-        as_json="also write every still's pose and bounds",
-        markdown=True,
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "folder",
-        nargs="*",
-        type=Path,
-        metavar="FOLDER",
+        "folder", nargs="*", type=Path, metavar="FOLDER",
         help="with stills and a config.yaml (default: all of ../shared/data/real)",
-    )
+    )  # fmt: skip
     parser.add_argument("--from-images", action="store_true", help="with gripper files made of these images")
     parser.add_argument("--distance", metavar="M:SIGMA", help="for --from-images, of folders for which none is fixed")
     parser.add_argument("--against", metavar="REV", help="also replay with gripmon of this commit, beside it")
@@ -63,51 +58,27 @@ def add_parser(commands: Any) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Handle ``tools/bench real``."""
+def run(arguments: argparse.Namespace, report: Report) -> None:
     if arguments.from_images:
-        return _run_from_images(arguments)
-    try:
-        sets = _sets(arguments)
-        runs = dict(_replayed(sets, arguments.against))
-    except ValueError as error:
-        print(f"tools/bench real: {error}", file=sys.stderr)
-        return 2
-    import msgspec
-
-    from benchmarks.real_figures import figures_of
-
+        _run_from_images(arguments, report)
+        return
+    runs = dict(_replayed(_sets(arguments), arguments.against))
     found = {revision: [(each, figures_of(each)) for each in made] for revision, made in runs.items()}
-    faults = missed(found[commit()])
-    text = report(found, faults)
-    options.deliver(arguments, "real", text, msgspec.to_builtins(runs))
-    return 1 if faults else 0
+    report.values["runs"] = msgspec.to_builtins(runs)
+    show(found, missed(found[commit()]), report)
 
 
-def _run_from_images(arguments: argparse.Namespace) -> int:
+def _run_from_images(arguments: argparse.Namespace, report: Report) -> None:
     """A set that is refused is a row, and doesn't keep the others from theirs."""
-    from tempfile import TemporaryDirectory
-
-    import msgspec
-
-    from benchmarks.real_figures import figures_of
-    from benchmarks.real_images import Task, made_from_images, missed_from_images, runs_of_made, table, tasks
-    from benchmarks.real_runs import runs_of
+    from benchmarks.real_images import Task, made_from_images, missed_from_images, runs_of_made, say_made, tasks
 
     known = tasks(LIMITS, PLAY_M)
     every, found, faults = [], [], []
     with TemporaryDirectory(prefix="gripmon-real-") as temporary:
         for folder in arguments.folder or sorted(FOLDER / name for name in known if (FOLDER / name).is_dir()):
             name = folder.resolve().name
-            task = known.get(name)
-            if task is None:
-                try:
-                    limit = _limit(name, arguments)
-                except ValueError as error:
-                    print(f"tools/bench real: {error}", file=sys.stderr)
-                    return 2
-                options_given = ("--distance", arguments.distance) if arguments.distance else ()
-                task = Task(options_given, limit, 0.0, PLAY_M)
+            given = ("--distance", arguments.distance) if arguments.distance else ()
+            task = known.get(name) or Task(given, _limit(name, arguments), 0.0, PLAY_M)
             print(f"real, from images: {name}", file=sys.stderr)
             for of_video in (False, True) if any(folder.glob("*.mp4")) else (False,):
                 made = made_from_images(name, folder, Path(temporary, f"{name}_{of_video}"), task, of_video)
@@ -117,30 +88,26 @@ def _run_from_images(arguments: argparse.Namespace) -> int:
                 faults += [f"{name}, from images: {refused}"] if refused else []
                 found += own
                 faults += missed_from_images(made, task, own, play_m)
-    text = "\n".join([*table(every), "", report({commit(): found}, faults)])
-    options.deliver(arguments, "real --from-images", text, msgspec.to_builtins([run for run, _ in found]))
-    return 1 if faults else 0
+    report.values["runs"] = msgspec.to_builtins([run for run, _ in found])
+    say_made(every, report)
+    show({commit(): found}, faults, report)
 
 
 def _limit(name: str, arguments: argparse.Namespace) -> Limit:
-    """A set's alert limit.  Raises ValueError if none is fixed for it and none given."""
-    from benchmarks.real_runs import Limit
-
+    """A set's alert limit.  Refused if none is fixed for it and none given."""
     if name in LIMITS:
         return Limit(*LIMITS[name])
     if arguments.limit is None:
-        raise ValueError(f"{name}: no alert limit is fixed for it; --limit MM DEGREES")
+        raise Refused(f"{name}: no alert limit is fixed for it; --limit MM DEGREES")
     return Limit(1e-3 * arguments.limit[0], math.radians(arguments.limit[1]))
 
 
 def _sets(arguments: argparse.Namespace) -> dict[str, tuple[Path, Limit]]:
-    """Folder and alert limit of each set.  Raises ValueError for one that can't be used."""
-    from benchmarks.real_runs import CONFIG
-
+    """Folder and alert limit of each set.  Refused is one that can't be used."""
     folders = arguments.folder
     if not folders:
         if not FOLDER.is_dir():
-            raise ValueError(f"{FOLDER} is not there; name a folder with stills and a {CONFIG}")
+            raise Refused(f"{FOLDER} is not there; name a folder with stills and a {CONFIG}")
         every = sorted(path for path in FOLDER.iterdir() if path.is_dir())
         folders = [path for path in every if (path / CONFIG).is_file()]
         for path in every:
@@ -150,39 +117,31 @@ def _sets(arguments: argparse.Namespace) -> dict[str, tuple[Path, Limit]]:
     for folder in folders:
         name = folder.resolve().name
         if not (folder / CONFIG).is_file():
-            raise ValueError(f"{folder}: has no {CONFIG}; a folder with stills and a configuration")
+            raise Refused(f"{folder}: has no {CONFIG}; a folder with stills and a configuration")
         if name in out:
-            raise ValueError(f"{folder}: another folder is called {name}; each under its own name")
+            raise Refused(f"{folder}: another folder is called {name}; each under its own name")
         out[name] = folder, _limit(name, arguments)
     return out
 
 
 def _replayed(sets: dict[str, tuple[Path, Limit]], against: str | None) -> Iterator[tuple[str, list[Run]]]:
     """Revision, and its runs: the other one's first."""
-    from benchmarks.real_runs import runs_of
-    from gripmon import InputError
-
     if against is not None:
-        from benchmarks.revision import commit_of
-
-        other = commit_of(against)[: len(commit().rstrip("+"))]
-        yield other, _elsewhere(sets, against)
+        try:
+            yield commit_of(against)[: len(commit().rstrip("+"))], _elsewhere(sets, against)
+        except ValueError as error:
+            raise Refused(str(error)) from None
     made: list[Run] = []
     for name, (folder, limit) in sets.items():
         print(f"real: {name}", file=sys.stderr)
         try:
             made += runs_of(name, folder, limit)
         except InputError as error:
-            raise ValueError(str(error)) from None
+            raise Refused(str(error)) from None
     yield commit(), made
 
 
 def _elsewhere(sets: dict[str, tuple[Path, Limit]], against: str) -> list[Run]:
-    import msgspec
-
-    from benchmarks.real_runs import Run
-    from benchmarks.revision import checkout_of, environment
-
     print(f"real: with {against}", file=sys.stderr)
     named = [f"{name}={m!r},{rad!r}={folder.resolve()}" for name, (folder, (m, rad)) in sets.items()]
     made = subprocess.run(
@@ -190,14 +149,12 @@ def _elsewhere(sets: dict[str, tuple[Path, Limit]], against: str) -> list[Run]:
         env=environment(checkout_of(against)), stdout=subprocess.PIPE, check=False,
     )  # fmt: skip
     if made.returncode != 0:
-        raise ValueError(f"gripmon of {against} failed (exit code {made.returncode}), see above")
+        raise Refused(f"gripmon of {against} failed (exit code {made.returncode}), see above")
     return [msgspec.json.decode(line, type=Run) for line in made.stdout.splitlines()]
 
 
-def missed(found: list[tuple[Run, Figures]]) -> list[str]:
+def missed(found: Found) -> list[str]:
     """What was to be reached and isn't, in words."""
-    from benchmarks.real_runs import BELIEF
-
     out = []
     for name in dict.fromkeys(run.name for run, _ in found):
         own = [(run, figures) for run, figures in found if run.name == name]
@@ -221,64 +178,52 @@ def untrue(figures: Figures, play_m: float) -> list[str]:
     if far:
         out.append(f"{len(far)} stills beyond their bound by more than play")
     if figures.alerts:
-        out.append(f"alerts that the mount moved: {_counts(figures.alerts)}")
+        out.append(f"alerts that the mount moved: {kit.counts(figures.alerts)}")
     return out
 
 
-_HEAD = (
-    "| set | commit | bound | measured | valid | median bound, mm, ° | 90 % within | `check` proposes "
-    "| scatter x y z, mm | about x y z, ° | χ² scatter | χ² motion | beyond it | alerts |\n"
-    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
-)
-
-
-def report(found: dict[str, list[tuple[Run, Figures]]], faults: list[str]) -> str:
+def show(found: dict[str, Found], faults: list[str], report: Report) -> None:
     """The table, a row for each set, way, bound and commit; what makes the bounds as large; what is missed."""
-    lines, why = [_HEAD], []
     every = [(revision, run, figures) for revision, own in found.items() for run, figures in own]
-    ways = dict.fromkeys((run.name, run.taught) for _, run, _ in every)
-    for way in ways:  # a commit's rows of one set beside the other's
-        for revision, run, figures in every:
-            if (run.name, run.taught) == way:
-                lines.append(_row(run, figures, revision))
-                why += _why(run, figures, revision)
-    targets = [f"MISSED: {fault}" for fault in faults] or ["every target is reached"]
-    return "\n".join([*lines, "", *why, "", *targets])
+    ways = list(dict.fromkeys((run.name, run.taught) for _, run, _ in every))
+    every.sort(key=lambda each: ways.index((each[1].name, each[1].taught)))  # a commit's beside the other's
+    report.say(kit.table(_HEAD, [_cells(run, figures, revision) for revision, run, figures in every]))
+    why = [f"- {line}" for revision, run, figures in every for line in _why(run, figures, revision)]
+    if why:
+        report.say("\n".join(why))
+    report.reach([(fault, "", False) for fault in faults] or [("every target is reached", "", True)])
 
 
-def _row(run: Run, figures: Figures, revision: str) -> str:
-    turned = [f"{v:.2f}" for v in map(math.degrees, figures.scatter[3:])]
+def _cells(run: Run, figures: Figures, revision: str) -> list[str]:
     beyond = str(len(figures.beyond))
     if figures.beyond:
         beyond += f" (by {1e3 * max(m for m, _ in figures.beyond):.2f} mm at most)"
     if run.bound == "reference":
         beyond += f", {len(figures.moved_beyond)} from the reference"
-    cells = [
+    return [
         f"{run.name}, {way(run)}",
         revision,
         run.bound,
         f"{figures.measured} of {figures.stills}",
         str(figures.valid),
-        _both(figures.bound),
-        _both(figures.least),
-        _both(figures.proposed),
+        *(_both(bounds) for bounds in (figures.bound, figures.least, figures.proposed)),
         " ".join(f"{1e3 * v:.2f}" for v in figures.scatter[:3]),
-        " ".join(turned),
+        " ".join(f"{math.degrees(v):.2f}" for v in figures.scatter[3:]),
         f"{figures.chi2_scatter:.3g}",
         f"{figures.chi2_motion:.3g}",
         beyond,
-        _counts(figures.alerts) or "0",
+        kit.counts(figures.alerts) or "0",
     ]
-    return f"| {' | '.join(cells)} |"
 
 
 def _why(run: Run, figures: Figures, revision: str) -> list[str]:
     what = f"{run.name}, {way(run)}, {run.bound}, {revision}"
     out = []
     if figures.hypotheses:
-        out.append(f"{what}: the bound is as large since it can't be excluded: {_counts(figures.hypotheses)}")
+        why = kit.counts(figures.hypotheses)
+        out.append(f"{what}: the bound is as large since it can't be excluded: {why}")
     if figures.reasons:
-        out.append(f"{what}: not measured: {_counts(figures.reasons)}")
+        out.append(f"{what}: not measured: {kit.counts(figures.reasons)}")
     return out + [f"{what}: {each}" for each in figures.teaching]
 
 
@@ -287,13 +232,5 @@ def way(run: Run) -> str:
     return "taught" if run.taught else "untaught"
 
 
-def _both(bounds: Any) -> str:
-    import numpy as np
-
-    if not np.isfinite(bounds).all():
-        return "none"
-    return f"{1e3 * bounds[0]:.3g}, {math.degrees(bounds[1]):.3g}"
-
-
-def _counts(counts: Counter[str]) -> str:
-    return ", ".join(f"{what} {number}" for what, number in counts.most_common())
+def _both(bounds: Array) -> str:
+    return f"{1e3 * bounds[0]:.3g}, {math.degrees(bounds[1]):.3g}" if np.isfinite(bounds).all() else "none"

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import cv2
 import yaml
 
+from benchmarks import kit
+from benchmarks.kit import Report
 from benchmarks.machine import ROOT
 from benchmarks.outlines import Beside, beside, drawn_outlines, projected_outline
 from benchmarks.real import untrue, way
@@ -203,23 +205,25 @@ def runs_of_made(
     return found, scale_m * task.play, None
 
 
-_HEAD = "| set | exit code | s | distance | written off drawn, px | drawn off written, px | drawn within 1 px |"
+_HEAD = (
+    "set", "exit code", "s", "distance", "written off drawn, px", "drawn off written, px", "drawn within 1 px",
+)  # fmt: skip
 
 
-def table(every: Sequence[Made]) -> list[str]:
+def say_made(every: Sequence[Made], report: Report) -> None:
     """A row for each set, distances of outlines in the median and at 95 %; below it what the command said."""
-    lines = [_HEAD, "| --- | --- | --- | --- | --- | --- | --- |"]
+    lines = []
     for made in every:
         cells = [made.row, str(made.code), f"{made.took_s:.0f}"]
         cells.append("" if math.isnan(made.distance_m) else f"{made.distance_m:.4g}")
         off = made.off
         if off is None:
-            cells += ["nothing usable" if made.folder is None else "nothing drawn", "", ""]
+            cells.append("nothing usable" if made.folder is None else "nothing drawn")
         else:
             cells += [f"{median:.2f}, {most:.2f}" for median, most in (off.written, off.drawn)]
-            cells.append(f"{100.0 * off.covered:.0f} %")
-        lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, "", *(f"{made.row}: {line}" for made in every for line in made.words)]
+            cells.append(f"{kit.percent(off.covered, 0)} %")
+        lines.append(cells)
+    report.say(kit.table(_HEAD, lines), "\n".join(f"- {made.row}: {line}" for made in every for line in made.words))
 
 
 def missed_from_images(made: Made, task: Task, found: Sequence[tuple[Run, Figures]], play_m: float) -> list[str]:

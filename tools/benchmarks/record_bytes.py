@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import harness, scene
+from benchmarks import harness, kit, scene
+from benchmarks.parts import Measured, Row
 from benchmarks.switched import SwitchedRecorder
 
 POLICIES: dict[str, dict[str, Any]] = {
@@ -26,20 +27,35 @@ _WRITTEN_WITHIN_S = 60.0
 class Plan:
     """Seconds of each policy that count, after some to begin with; which policies."""
 
-    sizes: tuple[scene.Size, ...] = ((768, 576), (1920, 1080))
-    ring: int = 60
     begin_s: float = 6.0
     seconds: float = 30.0
     policies: tuple[str, ...] = tuple(POLICIES)
 
 
-def measure(path: Path, size: scene.Size, plan: Plan) -> dict[str, Any]:
-    """Bytes an hour of every policy.  ``path`` holds rendered frames in which nothing happens."""
-    return {name: _one(path, size, plan, POLICIES[name]) for name in plan.policies}
+def measure(paths: tuple[Path, ...], plan: Plan) -> Measured:
+    """Bytes an hour of every policy, of frames in which nothing happens."""
+    rows, notes, values = [], [], {}
+    for path in paths:
+        ring = scene.Ring.load(path)
+        size = f"{ring.size[0]}x{ring.size[1]}"
+        found = values[size] = {name: _one(ring, plan, POLICIES[name]) for name in plan.policies}
+        default = found[plan.policies[0]]["bytes_per_hour"]
+        rows.append(Row(f"{size}: on the disk, {plan.policies[0]}", 1e-9 * default, "GB an hour"))
+        notes += [f"{size}, extrapolated to an hour at 60 frames/s from {plan.seconds:.0f} s each", _table(found)]
+    return Measured(tuple(rows), tuple(notes), values)
 
 
-def _one(path: Path, size: scene.Size, plan: Plan, changes: dict[str, Any]) -> dict[str, Any]:
-    config, ring = scene.config_for(size), scene.Ring.load(path)
+def _table(found: dict[str, dict[str, Any]]) -> str:
+    lines = []
+    for name, row in found.items():
+        gigabytes, hours = 1e-9 * row["bytes_per_hour"], 50e9 / row["bytes_per_hour"]
+        lasts = f"{hours:.0f} h" if hours < 72.0 else f"{hours / 24.0:.0f} days"
+        lines.append([name, f"{gigabytes:.2f}", f"{1e-3 * row['bytes_per_frame']:.2f}", lasts, row["images_dropped"]])
+    return kit.table(("", "GB an hour", "kB a frame", "50 GB last", "images dropped"), lines)
+
+
+def _one(ring: scene.Ring, plan: Plan, changes: dict[str, Any]) -> dict[str, Any]:
+    config = scene.config_for(ring.size)
     begin = round(plan.begin_s * scene.FPS)
     count = begin + round(plan.seconds * scene.FPS)
     marks: list[tuple[int, int]] = []

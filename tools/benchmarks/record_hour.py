@@ -8,6 +8,7 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,13 +18,15 @@ from typing import Any
 import cv2
 import msgspec
 
-from benchmarks import scene
+from benchmarks import parts, scene
 from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.files import FileSeries
 from gripmon.record.pictures import encode_picture
 from gripmon.record.recorder import Row, Scene, pack_trace
 
+WITHIN_S = 60.0
+"""To reach: each command on an hour."""
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),
     "correct": ("--out", "corrected.jsonl"),
@@ -35,8 +38,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 class Plan:
     """Frames of the recording and of each file; ``quiet`` and ``moving`` ones are judged and then repeated."""
 
-    size: tuple[int, int] = (768, 576)
-    ring: int = 60
     frames: int = 216_000
     in_file: int = 18_000
     quiet: int = 1200
@@ -53,10 +54,29 @@ class _Part:
     monitor: Monitor
 
 
+def measure(paths: tuple[Path, ...], plan: Plan) -> parts.Measured:
+    """Written here, read by the commands as processes; ``paths``: of quiet and of moving frames."""
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as directory:
+        written = write(*paths, Path(directory), plan)
+        done = read(Path(directory), plan)
+    rows = []
+    for name, each in done.items():
+        cpu = f"{each['cpu_s']:.1f} s of a core" + ("" if each["code"] == 0 else f"; {each['said']}")
+        rows.append(parts.Row(f"gripmon {name} of an hour", each["took_s"], "s", WITHIN_S, note=cpu))
+        if each["code"] != 0:
+            rows.append(parts.Row(f"gripmon {name} of an hour: not done, exit code {each['code']}", 1.0, "", 0.0))
+    said = (
+        f"{written['frames']:,} frames, {written['images']:,} images, {written['alerts']} alerts; {written['files']} "
+        f"files, {1e-9 * written['bytes']:.2f} GB (written in {written['written_s']:.0f} s), default policy"
+    )
+    return parts.Measured(tuple(rows), (said,), {"written": written, "read": done})
+
+
 def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, Any]:
     """Write the hour: quiet but for some frames in its middle, in which the mount creeps back and forth."""
     cv2.setNumThreads(1)
-    config = scene.config_for(plan.size)
+    calm_ring, busy_ring = scene.Ring.load(quiet), scene.Ring.load(moving)
+    config = scene.config_for(calm_ring.size)
     settings = msgspec.structs.replace(
         config.settings.recording, min_free_bytes=0, budget_bytes=0, max_file_s=1e9, max_file_bytes=1 << 40
     )
@@ -65,7 +85,7 @@ def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, A
         camera=config.settings.camera_name, lens=config.camera.settings, gripper=config.gripper.model,
         reference=config.reference,
     )  # fmt: skip
-    calm, busy = _judge(scene.Ring.load(quiet), plan.quiet), _judge(scene.Ring.load(moving), plan.moving)
+    calm, busy = _judge(calm_ring, plan.quiet), _judge(busy_ring, plan.moving)
     start_s = time.monotonic()
     images = _write(described, _sequence(calm.rows, busy.rows, plan.frames), plan)
     files = sorted(directory.glob("*.rrd"))
@@ -81,8 +101,7 @@ def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, A
 
 def _judge(ring: scene.Ring, count: int) -> _Part:
     """A monitor's records of this many frames; an image every sixth frame, which is 10 per second."""
-    height_px, width_px = ring.images.shape[1:]
-    config = scene.config_for((width_px, height_px))
+    config = scene.config_for(ring.size)
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
     rows = []
     pictures: dict[int, Any] = {}

@@ -10,23 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import harness, scene, stalled_disk
+from benchmarks import harness, kit, scene, stalled_disk
+from benchmarks.parts import Measured, Row
 from benchmarks.switched import SwitchedRecorder
 from gripmon.daemon.config import Config
 
-CONDITIONS = ("off", "on", "stalled")
+CONDITIONS = {"off": "off", "on": "on", "stalled": "on, disk stalled"}
+MEDIAN, TAIL = 1.10, 1.25
+"""To reach: times with recording over those without, medians and 99th percentiles."""
 _CAUGHT_UP_WITHIN_S = 60.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Frames of each condition at a time, of them to settle, and turns of all three."""
+    """Frames of each condition at a time, of them to settle, and turns of all three; whether a disk may be mounted."""
 
-    sizes: tuple[scene.Size, ...] = ((768, 576), (1920, 1080))
-    ring: int = 60
     block: int = 600
     settle: int = 60
     rounds: int = 6
+    may_mount: bool = True
 
 
 class _Recorder(SwitchedRecorder):
@@ -59,14 +61,49 @@ class _Recorder(SwitchedRecorder):
         self._dropped_before = self.dropped
 
 
-def measure(path: Path, size: scene.Size, plan: Plan, may_mount: bool = True) -> dict[str, Any]:
-    """Times of every condition, µs, as plain values; ``path`` holds the rendered frames."""
-    config, ring = scene.config_for(size), scene.Ring.load(path)
-    order = [CONDITIONS[(i + turn) % 3] for turn in range(plan.rounds) for i in range(3)]
+def measure(paths: tuple[Path, ...], plan: Plan) -> Measured:
+    """At each size."""
+    rows: list[Row] = []
+    notes, values = ["at 60 frames/s, in turns: ms, median / 99 % (longest)"], {}
+    for path in paths:
+        ring = scene.Ring.load(path)
+        size = f"{ring.size[0]}x{ring.size[1]}"
+        found = values[size] = _one(ring, plan)
+        rows += _rows(size, found)
+        notes += [f"{size}; stalled: {found['how']}", _table(found)]
+    return Measured(tuple(rows), tuple(notes), values)
+
+
+def _rows(size: str, found: dict[str, Any]) -> list[Row]:
+    return [
+        Row(f"{size}: {what}, {CONDITIONS[condition]}: {label} over that of off",
+            found[condition][times][figure] / found["off"][times][figure], "", limit)
+        for what, times in (("until published", "published_us"), ("whole loop", "loop_us"))
+        for condition in ("on", "stalled")
+        for figure, label, limit in (("median", "median", MEDIAN), ("p99", "99 %", TAIL))
+    ]  # fmt: skip
+
+
+def _table(found: dict[str, Any]) -> str:
+    lines = []
+    for condition, title in CONDITIONS.items():
+        row = found[condition]
+        times = (
+            f"{1e-3 * us['median']:.3f} / {1e-3 * us['p99']:.3f} ({1e-3 * us['max']:.1f})"
+            for us in (row["published_us"], row["loop_us"])
+        )
+        lines.append([title, *times, row["frames"], found["dropped"][condition]])
+    return kit.table(("", "until published", "whole loop", "frames", "not recorded"), lines)
+
+
+def _one(ring: scene.Ring, plan: Plan) -> dict[str, Any]:
+    """Times of every condition, µs."""
+    config, conditions = scene.config_for(ring.size), tuple(CONDITIONS)
+    order = [conditions[(i + turn) % 3] for turn in range(plan.rounds) for i in range(3)]
     count = plan.block * len(order)
     with (
         tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch,
-        stalled_disk.disk(Path(scratch), may_mount=may_mount) as disk,
+        stalled_disk.disk(Path(scratch), may_mount=plan.may_mount) as disk,
     ):
         recorder = _Recorder(config, disk)
 

@@ -6,17 +6,21 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import machine, scene
+from benchmarks import kit, machine, scene
+from benchmarks.parts import Measured, Row
 from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 from gripmon.monitor import Monitor
 from gripmon.record.write import ProcessRecorder, open_recorder
 
+SIZE = (384, 288)
+FLAT_MIB = 1.0
+"""To reach: MiB that an hour adds at most."""
+_WHO = {"daemon_mib": "daemon's side", "process_mib": "recording process"}
 FRAMES_PER_HOUR = round(3600 * scene.FPS)
 _LIGHT = {
     # Files as many as in a day, and most of them deleted again; images as seldom as makes frames light.
@@ -34,17 +38,16 @@ class Plan:
     repeated.
     """
 
-    size: tuple[int, int] = (384, 288)
-    ring: int = 30
     hours: float = 24.0
     look_every: int = 20_000
     judged: int = 240
     warm_up: float = 0.15
 
 
-def measure(path: Path, plan: Plan) -> dict[str, Any]:
+def measure(paths: tuple[Path, ...], plan: Plan) -> Measured:
     """Memory over the hours, and its slope once it has settled (after the plan's share ``warm_up``)."""
-    config, ring = scene.config_for(plan.size), scene.Ring.load(path)
+    ring = scene.Ring.load(paths[0])
+    config = scene.config_for(ring.size)
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
     judged = [_judge(monitor, ring.frame(seq)) for seq in range(plan.judged)]
     count = round(plan.hours * FRAMES_PER_HOUR)
@@ -60,16 +63,19 @@ def measure(path: Path, plan: Plan) -> dict[str, Any]:
         took_s = time.monotonic() - start_s
         recorder.close(timeout_s=60.0)
         numbers = [int(file.stem.rpartition("-")[2]) for file in Path(directory).glob("*.rrd")]
-    return {
-        "frames": count,
-        "hours": plan.hours,
-        "took_s": took_s,
-        "written": recorder.frames_written,
-        "dropped": recorder.dropped,
-        "files": max(numbers),
-        "looks": looks,
-        "slopes": {who: slope(looks, who, plan.warm_up) for who in ("daemon_mib", "process_mib")},
-    }
+    slopes = {who: slope(looks, who, plan.warm_up) for who in _WHO}
+    rows = (
+        Row(f"memory of the {title}", slopes[who]["mib_per_hour"], "MiB an hour", FLAT_MIB,
+            note=f"± {slopes[who]['sigma_mib_per_hour']:.3f}")
+        for who, title in _WHO.items()
+    )  # fmt: skip
+    said = (
+        f"{count:,} frames, {plan.hours:g} h at 60/s, in {took_s:.0f} s; {recorder.frames_written:,} written, "
+        f"{recorder.dropped} dropped; files: {max(numbers)}"
+    )
+    shown = looks[:: max(len(looks) // 12, 1)]
+    cells = [[f"{look['hours']:.2f}", *(f"{look[who]:.1f}" for who in _WHO)] for look in shown]
+    return Measured(tuple(rows), (said, kit.table(("hours", *_WHO.values()), cells)), {"looks": looks})
 
 
 def _judge(monitor: Monitor, frame: Frame) -> tuple[Frame, FrameRecord, MeasurementTrace | None]:

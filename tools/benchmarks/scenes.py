@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import drawn
-from benchmarks.conditions import Condition, Draw, scenario
+from benchmarks.conditions import Condition, SceneDraft, scenario
 from benchmarks.drawn import Place, finger_look, in_view, sensor
 from benchmarks.fingers import bevelled, gripper_models, gripper_of, without_finger
 from benchmarks.tags import FingerTags
@@ -136,11 +136,11 @@ def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Sce
     gripper = gripper_of(model)
     cam_T_grip, opening_m = _placed(rng, camera, gripper)
     look = ordinary_look(rng)
-    draw = Draw(rng, frames, opening_m, (gripper.jaw_min_m, gripper.jaw_max_m), *look)
+    draft = SceneDraft(rng, frames, opening_m, *look, (gripper.jaw_min_m, gripper.jaw_max_m))
     shown = gripper
     if condition.missing_finger:
         shown = gripper_of(without_finger(model, str(rng.choice(gripper.finger_ids))))
-    simulator = Rig(camera, shown, cam_T_grip).simulator(scenario(condition, draw), int(rng.integers(2**31)))
+    simulator = Rig(camera, shown, cam_T_grip).simulator(scenario(condition, draft), int(rng.integers(2**31)))
     start, taught = drawn.reference(rng, simulator.truth(0).cam_T_grip), None
     if condition.taught:
         # What is taught holds at the reference by definition, so that is exact, and the camera has moved since.

@@ -1,17 +1,5 @@
-"""``tools/bench shapes``: fingers of any shape, with models from CAD, while the camera moves."""
+"""Fingers of any shape, from CAD, while the camera moves.
 
-from __future__ import annotations
-
-import argparse
-import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
-from benchmarks import options
-
-_DESCRIPTION = """\
 Makes gripper files from meshes, as `gripmon gripper from-cad --bevel 0` does, and tracks pictures of them: another
 piece of background behind the fingers in each frame, the camera wandering on a smooth way by as much as the row says
 along and about each axis, the jaws by 1 mm.  Valid: share of the frames from the second on (the first has none before
@@ -19,26 +7,49 @@ it that confirms it).  Misleading: valid and off by more than the alert limit; b
 own bound.  Error: median distance of the TCP from the truth, over that of sharp boxes that show as much of themselves.
 Last the tapered fingers with pads of `tools/bench integrity`, whose file is made by `gripmon gripper from-images` and
 taught by `gripmon teach`, through a change of the lamp, a grasp and a knock of 2 mm: 180 frames.
-Takes some ten minutes."""
+Takes some ten minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks import kit
+from benchmarks.drawn import reference_record
+from benchmarks.kit import Report
+from benchmarks.meshes import MeshCamera, box_fingers, curved_fingers, rounded_fingers, wandering, write_meshes
+from gripmon.model.camera import Camera, make_camera
+from gripmon.model.records import Array, Frame, FrameRecord, Origin, Verdict
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.simulate import PAPER_LENS, paper_cam_T_grip
+from gripmon.teach.cad import gripper_from_cad
 
 VALID, RATIO = 0.98, 2.0
 """To reach: share of valid frames, and error over the sharp boxes'."""
-
 NEWCOMER, NEWCOMER_VALID = "tapered, with pads, from images", 0.90
 """Row, and share of valid frames to reach through a working day."""
-
 MOTIONS = {"0.2 mm, 0.2°": (2e-4, 3.5e-3), "2 mm, 1°": (2e-3, 1.75e-2)}
 """How far the camera wanders: m and rad."""
-
 LENGTH_M = 0.035
 SHOWN_PX = 25.0
 """What of a finger shows that the image's border cuts."""
+_EXACT = np.diag(np.square([2e-6] * 3 + [1e-4] * 3))
+_HEAD = ("shape", "camera moves by", "valid", "misleading", "beyond", "error, µm", "over the box's", "")
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Fingers and how they show: ``meshes`` of a module that is loaded late, ``beside`` which row's error is compared,
-    ``fingers`` how many of them, ``tone`` two tones, ``cut`` by the image's border.
+    """Fingers and how they show: ``meshes``, ``beside`` which row's error is compared, ``fingers`` how many of them,
+    ``tone`` two tones, ``cut`` by the image's border.
     """
 
     name: str
@@ -49,31 +60,28 @@ class Shape:
     cut: bool = False
 
 
-def shapes() -> list[Shape]:
-    """All rows, those that others are compared with before them."""
-    from benchmarks.meshes import box_fingers, curved_fingers, rounded_fingers
-
-    def rounded(radius_m: float) -> Callable[[], list[Any]]:
-        return lambda: rounded_fingers(radius_m)
-
-    box, cut, one = "sharp box", "sharp box, cut by the border", "sharp box, one finger"
-    return [
-        Shape(box, box_fingers, box),
-        *(Shape(f"rounded by {r} mm", rounded(1e-3 * r), box) for r in (2, 4, 8)),
-        Shape("curved finger", curved_fingers, box),
-        Shape("sharp box, two tones", box_fingers, box, tone=(-0.012, 0.5)),
-        Shape("rounded by 4 mm, two tones", rounded(0.004), box, tone=(-0.012, 0.5)),
-        Shape(cut, box_fingers, cut, cut=True),
-        Shape("rounded by 2 mm, cut", rounded(0.002), cut, cut=True),
-        Shape("rounded by 4 mm, cut", rounded(0.004), cut, cut=True),
-        Shape(one, box_fingers, one, fingers=1),
-        Shape("rounded by 4 mm, one finger", rounded(0.004), one, fingers=1),
-        Shape("sharp box, one finger, two tones", box_fingers, one, fingers=1, tone=(-0.004, 0.6)),
-    ]
+def _rounded(mm: float) -> Callable[[], list[Any]]:
+    return partial(rounded_fingers, 1e-3 * mm)
 
 
-@dataclass(frozen=True)
-class Tracked:
+_BOX, _CUT, _ONE = "sharp box", "sharp box, cut by the border", "sharp box, one finger"
+SHAPES = (
+    Shape(_BOX, box_fingers, _BOX),
+    *(Shape(f"rounded by {r} mm", _rounded(r), _BOX) for r in (2, 4, 8)),
+    Shape("curved finger", curved_fingers, _BOX),
+    Shape("sharp box, two tones", box_fingers, _BOX, tone=(-0.012, 0.5)),
+    Shape("rounded by 4 mm, two tones", _rounded(4), _BOX, tone=(-0.012, 0.5)),
+    Shape(_CUT, box_fingers, _CUT, cut=True),
+    Shape("rounded by 2 mm, cut", _rounded(2), _CUT, cut=True),
+    Shape("rounded by 4 mm, cut", _rounded(4), _CUT, cut=True),
+    Shape(_ONE, box_fingers, _ONE, fingers=1),
+    Shape("rounded by 4 mm, one finger", _rounded(4), _ONE, fingers=1),
+    Shape("sharp box, one finger, two tones", box_fingers, _ONE, fingers=1, tone=(-0.004, 0.6)),
+)
+"""All rows, those that others are compared with before them."""
+
+
+class Tracked(NamedTuple):
     """What a monitor made of ``frames``: how many were valid, misleading, beyond their own bound; median error, m, of
     those with a measurement; why frames weren't valid, the most frequent reason.
     """
@@ -86,32 +94,90 @@ class Tracked:
     why: str
 
 
+class Tally:
+    """Counts what a monitor makes of frames whose truth is known; the first, which none confirms, doesn't count as
+    valid or not.
+    """
+
+    def __init__(self, alert_limit_m: float) -> None:
+        self._limit_m, self._seen = alert_limit_m, 0
+        self._errors: list[float] = []
+        self._counts, self._why = [0, 0, 0], Counter[str]()
+
+    def add(self, record: FrameRecord, true_cam_T_grip: Array) -> None:
+        counted, off_m = self._seen > 0, float("nan")
+        self._seen += 1
+        if record.cam_T_grip is not None:
+            off_m = float(np.linalg.norm(np.array(record.cam_T_grip.translation_m) - true_cam_T_grip[:3, 3]))
+            if record.source is not Origin.HELD:
+                self._errors.append(off_m)
+        if record.verdict is not Verdict.VALID:
+            # What a reason owes its bound to, without its numbers; the whole reason where it owes it to nothing.
+            self._why[(record.reason or "").rpartition("excluded that ")[2]] += counted
+            return
+        assert record.protection is not None
+        self._counts[0] += counted
+        self._counts[1] += off_m > self._limit_m
+        self._counts[2] += off_m > record.protection.position_m
+
+    def tracked(self) -> Tracked:
+        commonest = self._why.most_common(1)[0][0] if self._why.total() else ""
+        error_m = float(np.median(self._errors)) if self._errors else float("nan")
+        return Tracked(self._seen - 1, *self._counts, error_m, commonest)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
+    kit.numbers(parser, frames=(60, "of each row"))
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these rows, and the box's")
+
+
+def run(arguments: argparse.Namespace, report: Report) -> None:
+    only = kit.chosen(arguments.only, [*(shape.name for shape in SHAPES), NEWCOMER])
+    made = list(kit.progress(rows(arguments.frames, arguments.seed, only), "row"))
+    report.values |= {"seed": arguments.seed, "rows": [dict(zip(_HEAD, row, strict=True)) for row in made]}
+    report.say(kit.table(_HEAD, made))
+
+
+def rows(frames: int, seed: int, only: Sequence[str]) -> Iterator[list[str]]:
+    """Cells of the table, as they are measured."""
+    usual: dict[tuple[str, str], float] = {}
+    wanted = {name for shape in SHAPES if shape.name in only for name in (shape.name, shape.beside)}
+    for shape in SHAPES:
+        for motion, (most_m, most_rad) in MOTIONS.items() if shape.name in wanted else ():
+            with tempfile.TemporaryDirectory() as folder:
+                seen = track(shape, most_m, most_rad, frames, seed, Path(folder))
+            usual.setdefault((shape.name, motion), seen.error_m)
+            ratio = seen.error_m / usual[shape.beside, motion]
+            met = seen.valid >= VALID * seen.frames and not seen.misleading and ratio <= RATIO
+            yield [shape.name, motion, *_cells(seen, f"{ratio:.1f}", met)]
+    if NEWCOMER in only:
+        from benchmarks import newcomer
+
+        with tempfile.TemporaryDirectory() as folder:
+            seen = newcomer.day(seed, 0, Path(folder))
+        met = seen.valid >= NEWCOMER_VALID * seen.frames and not seen.misleading
+        yield [NEWCOMER, "lamp, grasp, knock of 2 mm", *_cells(seen, "", met)]
+
+
+def _cells(seen: Tracked, ratio: str, met: bool) -> list[str]:
+    counts = [f"{100.0 * seen.valid / seen.frames:.0f} %", str(seen.misleading), str(seen.beyond)]
+    return [*counts, f"{1e6 * seen.error_m:.1f}", ratio, "met" if met else f"**missed** {seen.why or 'error'}"]
+
+
 def track(shape: Shape, most_m: float, most_rad: float, frames: int, seed: int, folder: Path) -> Tracked:
     """One sequence."""
-    from collections import Counter
-
-    import numpy as np
-
-    from benchmarks.meshes import MeshCamera, wandering, write_meshes
-    from gripmon.model.camera import make_camera
-    from gripmon.model.records import Frame, Origin, Verdict
-    from gripmon.monitor import Monitor, MonitorSettings
-    from gripmon.simulate import PAPER_LENS
-    from gripmon.teach.cad import gripper_from_cad
-
     camera, meshes = make_camera(PAPER_LENS), shape.meshes()[: shape.fingers]
-    pose = _pose(camera, shape.cut)
-    jaw_range_m = (0.0, 0.06) if shape.fingers > 1 else None
-    paths = write_meshes(meshes, folder)
+    pose = pose_of(camera, shape.cut)
     # The TCP stays that of both fingers, so that poses and errors are alike.
-    made = gripper_from_cad(
-        paths, unit="mm", jaw_range_m=jaw_range_m, camera=camera, cam_T_grip=pose, bevel_m=0.0,
+    gripper = gripper_from_cad(
+        write_meshes(meshes, folder), unit="mm", jaw_range_m=(0.0, 0.06) if shape.fingers > 1 else None,
+        camera=camera, cam_T_grip=pose, bevel_m=0.0,
         **({"length_m": LENGTH_M} if shape.fingers > 1 else {"frame": "cad"}),
-    )  # fmt: skip
-    gripper, settings = made.gripper, MonitorSettings()
-    monitor = Monitor(camera, gripper, settings, _reference(pose))
-    pictures = MeshCamera(camera, meshes, seed, shape.tone)
-    errors, counts, why = [], [0, 0, 0], Counter[str]()
+    ).gripper  # fmt: skip
+    settings = MonitorSettings()
+    monitor = Monitor(camera, gripper, settings, reference_record(pose, _EXACT))
+    pictures, tally = MeshCamera(camera, meshes, seed, shape.tone), Tally(settings.policy.alert_limit_m)
     for k in range(frames):
         truth_T = wandering(pose, k / frames, most_m, most_rad)
         opened_m = 0.001 * np.sin(2.0 * np.pi * k / frames) if gripper.has_jaw else 0.0
@@ -120,113 +186,18 @@ def track(shape: Shape, most_m: float, most_rad: float, frames: int, seed: int, 
         image = pictures.picture(truth_T, offsets)
         record = monitor.process(Frame(seq=k, stamp_ns=int(k / 30 * 1e9), image=image, jaw_opening_m=opening_m))
         monitor.run_pending()
-        if record.cam_T_grip is None:
-            why[record.reason or ""] += k > 0
-            continue
-        off_m = float(np.linalg.norm(np.array(record.cam_T_grip.translation_m) - truth_T[:3, 3]))
-        if record.source is not Origin.HELD:
-            errors.append(off_m)
-        if record.verdict is Verdict.VALID:
-            assert record.protection is not None
-            counts[0] += k > 0
-            counts[1] += off_m > settings.policy.alert_limit_m
-            counts[2] += off_m > record.protection.position_m
-        else:
-            why[_kind(record.reason or "")] += k > 0
-    commonest = why.most_common(1)[0][0] if why.total() else ""
-    return Tracked(frames - 1, *counts, float(np.median(errors)) if errors else float("nan"), commonest)
+        tally.add(record, truth_T)
+    return tally.tracked()
 
 
-def _kind(reason: str) -> str:
-    """What a reason owes its bound to, without its numbers; the whole reason where it owes it to nothing."""
-    return reason.rpartition("excluded that ")[2]
-
-
-def _pose(camera: Any, cut: bool) -> Any:
+def pose_of(camera: Camera, cut: bool) -> Array:
     """The camera tilted about its x axis against the gripper, as in the paper; or moved so that the image's lower
     border leaves :data:`SHOWN_PX` of the fingers.
     """
-    import numpy as np
-
-    from gripmon.simulate import paper_cam_T_grip
-
     cam_T_grip = paper_cam_T_grip()
     tip = cam_T_grip[:3, :3] @ np.array([0.022, -0.008, 0.0])
-    if cut:
-        for _ in range(20):
-            at = tip + cam_T_grip[:3, 3]
-            away_px = camera.height_px - 1.0 - SHOWN_PX - camera.project(at[None])[0, 1]
-            cam_T_grip[1, 3] += away_px * at[2] / camera.fy_px
+    for _ in range(20 if cut else 0):
+        at = tip + cam_T_grip[:3, 3]
+        away_px = camera.height_px - 1.0 - SHOWN_PX - camera.project(at[None])[0, 1]
+        cam_T_grip[1, 3] += away_px * at[2] / camera.fy_px
     return cam_T_grip
-
-
-def _reference(cam_T_grip: Any) -> Any:
-    """Exact to 2 µm and 0.1 mrad."""
-    import numpy as np
-
-    from gripmon.model.geometry import to_record
-    from gripmon.model.records import ReferenceRecord
-
-    covariance = np.diag(np.square([2e-6] * 3 + [1e-4] * 3))
-    return ReferenceRecord("shapes", 1, 0, "exact", to_record(cam_T_grip), tuple(covariance.ravel().tolist()))
-
-
-def report(frames: int, seed: int, only: list[str]) -> Iterator[str]:
-    """The table by lines, as it is measured."""
-    import tempfile
-
-    yield "| shape | camera moves by | valid | misleading | beyond | error, µm | over the box's | |"
-    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
-    usual: dict[tuple[str, str], float] = {}
-    every = shapes()
-    wanted = {name for shape in every if not only or shape.name in only for name in (shape.name, shape.beside)}
-    for shape in every:
-        for motion, (most_m, most_rad) in MOTIONS.items() if shape.name in wanted else ():
-            with tempfile.TemporaryDirectory() as folder:
-                seen = track(shape, most_m, most_rad, frames, seed, Path(folder))
-            usual.setdefault((shape.name, motion), seen.error_m)
-            ratio = seen.error_m / usual[shape.beside, motion]
-            met = seen.valid >= VALID * seen.frames and not seen.misleading and ratio <= RATIO
-            cells = [
-                shape.name, motion, f"{100.0 * seen.valid / seen.frames:.0f} %", seen.misleading, seen.beyond,
-                f"{1e6 * seen.error_m:.1f}", f"{ratio:.1f}", "met" if met else f"**missed** {seen.why or 'error'}",
-            ]  # fmt: skip
-            yield "| " + " | ".join(map(str, cells)) + " |"
-    if not only or NEWCOMER in only:
-        yield _newcomer(seed)
-
-
-def _newcomer(seed: int) -> str:
-    """The row of a gripper of which there are only images."""
-    import tempfile
-
-    from benchmarks.newcomer import day
-
-    with tempfile.TemporaryDirectory() as folder:
-        seen = day(seed, 0, Path(folder))
-    met = seen.valid >= NEWCOMER_VALID * seen.frames and not seen.misleading
-    return (
-        f"| {NEWCOMER} | lamp, grasp, knock of 2 mm | {100.0 * seen.valid / seen.frames:.0f} % | {seen.misleading} "
-        f"| {seen.beyond} | {1e6 * seen.error_m:.1f} | | {'met' if met else f'**missed** {seen.why}'} |"
-    )
-
-
-def add_parser(commands: Any) -> None:
-    help_line = "fingers of any shape, from CAD, while the camera moves"
-    parser = options.add_command(commands, "shapes", run, help_line, _DESCRIPTION, seed=True, markdown=True)
-    parser.add_argument("--frames", type=options.positive, default=60, metavar="N", help="of each row (default 60)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these rows, and the box's")
-
-
-def run(arguments: argparse.Namespace) -> int:
-    from benchmarks.machine import commit
-
-    lines = [f"`tools/bench shapes --frames {arguments.frames} --seed {arguments.seed}`, commit {commit()}", ""]
-    print(*lines, sep="\n", flush=True)
-    for line in report(arguments.frames, arguments.seed, arguments.only):
-        lines.append(line)
-        print(line, flush=True)
-    if arguments.markdown:
-        arguments.markdown.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        print(f"written: {arguments.markdown}", file=sys.stderr)
-    return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -13,19 +12,13 @@ from pathlib import Path
 
 import zenoh
 
-from benchmarks.harness import Subscriber
+from benchmarks.harness import Subscriber, free_endpoint
 from benchmarks.machine import ROOT
 from gripmon.io.wire import DEFAULT_ENDPOINT
 
-_STALLER = Path(__file__).parent / "staller.py"
+_SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _MATCH_S = 0.3
 _BALLAST_PUTS, _BALLAST_BYTES, _BALLAST_PAUSE_S = 400, 60_000, 0.002
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Staller:
@@ -36,7 +29,7 @@ class Staller:
 
     def __init__(self, session: zenoh.Session, endpoint: str, key: str, *, stop: bool) -> None:
         ballast = f"{key}/ballast"
-        command = [sys.executable, str(_STALLER), endpoint, key, ballast, "free" if stop else "block"]
+        command = [sys.executable, str(_SUBSCRIBER), endpoint, key, ballast, "free" if stop else "block"]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         if self._process.stdout.readline() != "ready\n":

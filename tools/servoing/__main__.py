@@ -1,16 +1,5 @@
-"""``tools/servo``: its report goes to standard output, progress to standard error."""
+"""A visual servo of a simulated arm that carries the camera which a real monitor watches.
 
-from __future__ import annotations
-
-import argparse
-import importlib.util
-import json
-import os
-import sys
-from pathlib import Path
-from typing import Any
-
-_DESCRIPTION = """\
 A simulated six-axis arm with a camera at its wrist grasps an object by what the camera sees.  Half way of the
 approach the camera's mount is knocked by 1.5 or 4.5 mm in any direction, with some rotation; in every other row a
 hand then covers the view.  A real monitor (gripmon run, a process of its own) watches the images of that camera and
@@ -18,58 +7,70 @@ its transforms come over Zenoh.  Four arms do the same on the same images: by th
 gripmon), by the monitor's transform, by its smoothed transform, and by the truth.  The arms that follow the monitor
 keep to its verdicts: they stop on unknown, go on slowly by what is suspect, begin and grasp by what is valid only.
 
-Printed is how far the tool centre point (TCP) ends from where it should hold the object."""
-
-_EPILOG = """\
-examples:
-  tools/servo
-  tools/servo --runs 3 --plot servo.png --json servo.json
-  tools/servo --realtime        the camera as on a robot: frames that come too late are dropped, transforms age
+Printed is how far the tool centre point (TCP) ends from where it should hold the object.
 
 The loop is closed on frames: between two of them each arm moves by the command that the earlier one gave, for the
 time between their stamps.  Without --realtime the monitor takes every frame as fast as it can, and time is that of the
 frames, so that a seed gives the same figures again, whatever else the machine does.
 
-exit codes: 0 all figures reached; 1 not all; 2 wrong usage; 3 the monitor failed; 130 interrupted"""
+exit codes: 0 all figures reached; 1 not all; 2 wrong usage; 3 the monitor failed; 130 interrupted
+"""
 
-_EXIT_MISSED, _EXIT_USAGE, _EXIT_FAILED, _EXIT_INTERRUPTED = 1, 2, 3, 130
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+_EXIT_USAGE, _EXIT_FAILED, _EXIT_INTERRUPTED = 2, 3, 130
 
 
 def main() -> int:
     arguments = _parser().parse_args()
-    for package in ("pinocchio", *(("matplotlib",) if arguments.plot else ())):
-        if importlib.util.find_spec(package) is None:
-            print(f"servo: {package} is not installed; tools/servo, or pip install '.[bench]'", file=sys.stderr)
-            return _EXIT_USAGE
-    for option, path in (("--json", arguments.json), ("--plot", arguments.plot)):
-        if path is not None and not os.access(path if path.exists() else path.parent, os.W_OK):
-            print(f"servo: {option} {path}: can't be written; a file in a folder of your own", file=sys.stderr)
-            return _EXIT_USAGE
+    if importlib.util.find_spec("pinocchio") is None:
+        print("servo: pinocchio is not installed; tools/servo, or pip install '.[bench]'", file=sys.stderr)
+        return _EXIT_USAGE
     # Four arms and a monitor share the cores.  Has to come before NumPy is imported.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
+    from benchmarks.kit import Refused, Report, writable
+
+    from servoing import report as reports
+    from servoing.feed import FeedError
+
     try:
-        return _run(arguments)
+        writable(arguments.json, arguments.markdown)
+        report = Report(" ".join(["tools/servo", *sys.argv[1:]]))
+        reports.show(_measure(arguments), report)
+        report.values |= {"seed": arguments.seed, "realtime": arguments.realtime}
+        return report.end(arguments.json, arguments.markdown)
+    except Refused as error:
+        print(f"servo: {error}", file=sys.stderr)
+        return _EXIT_USAGE
+    except FeedError as error:
+        print(f"servo: {error}", file=sys.stderr)
+        return _EXIT_FAILED
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="tools/servo",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="tools/servo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--runs", type=_count, default=10, metavar="N", help="of each of the four rows (default 10)")
     parser.add_argument("--seed", type=_seed, default=1, metavar="N", help="of everything random (default 1)")
     parser.add_argument("--fps", type=_rate, default=30.0, metavar="HZ", help="frame rate of the camera (default 30)")
     parser.add_argument(
-        "--realtime", action="store_true", help="a live camera; needs a machine with nothing else to do"
-    )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw distance over time, a run of each row (PNG)")
+        "--realtime", action="store_true",
+        help="a live camera, as on a robot: frames that come too late are dropped, transforms age; needs a machine "
+        "with nothing else to do",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
-    parser.add_argument("--markdown", action="store_true", help="print the table for a document, too")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the report as a Markdown file")
     return parser
 
 
@@ -95,49 +96,18 @@ def _rate(text: str) -> float:
     return value
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    from benchmarks import machine
-
-    from servoing import report
-    from servoing.feed import FeedError
-    from servoing.figures import figures, targets
-
-    about = machine.description()
-    try:
-        runs = _measure(arguments)
-    except FeedError as error:
-        print(f"servo: {error}", file=sys.stderr)
-        return _EXIT_FAILED
-    every = figures(runs)
-    reached = targets(every)
-    print(report.as_text(about, runs, every, reached))
-    if arguments.markdown:
-        print("\n" + report.markdown(every))
-    if arguments.json is not None:
-        values = report.as_values(about, every, reached) | {"seed": arguments.seed, "realtime": arguments.realtime}
-        arguments.json.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    if arguments.plot is not None:
-        from servoing import plot
-
-        plot.draw(runs, arguments.plot)
-    return 0 if all(target.met for target in reached) else _EXIT_MISSED
-
-
 def _measure(arguments: argparse.Namespace) -> list[Any]:
-    from tqdm import tqdm
+    from benchmarks import kit
 
     from servoing import runs, stage
 
-    out = []
     total = sum(round(stage.duration_s(row) * arguments.fps) for row in stage.ROWS) * arguments.runs
-    with tqdm(total=total, desc="frames", unit="frame", file=sys.stderr, disable=None) as bar:
-        for row in stage.ROWS:
-            for number in range(arguments.runs):
-                bar.set_postfix_str(f"{row.name}, run {number + 1}")
-                out.append(
-                    runs.run(row, number, arguments.seed, arguments.fps, realtime=arguments.realtime, step=bar.update)
-                )
-    return out
+    with kit.bar("frame", total) as bar:
+        return [
+            runs.run(row, number, arguments.seed, arguments.fps, realtime=arguments.realtime, step=bar.update)
+            for row in stage.ROWS
+            for number in range(arguments.runs)
+        ]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import socket
 import subprocess
 import sys
 import time
@@ -119,10 +118,3 @@ def feed(folder: Path, config: Config, policy: Policy) -> Iterator[Feed]:
         finally:
             process.terminate()
             process.wait()
-
-
-def free_endpoint() -> str:
-    """A Zenoh endpoint on a loopback port that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

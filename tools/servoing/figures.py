@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarks.kit import Target
 
 from gripmon.model.records import Array, Verdict
 from servoing.runs import GRIPMON, SMOOTHED, SOURCES, TRUTH, WITHOUT, Run, Track
@@ -100,15 +101,6 @@ def _of(runs: Sequence[Run], source: str) -> Figures:
         conduct=tuple(conduct(run, track) for run, track in zip(runs, tracks, strict=True)),
         stopped_by_range=sum(track.stopped_by_range for track in tracks),
     )
-
-
-@dataclass(frozen=True)
-class Target:
-    """What was to be reached, what was measured, and whether it is met."""
-
-    what: str
-    measured: str
-    met: bool
 
 
 def targets(every: Sequence[Figures]) -> list[Target]:

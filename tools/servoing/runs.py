@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from benchmarks.harness import free_endpoint
 
 from gripmon.client import Policy, Reading
 from gripmon.model.geometry import invert
@@ -17,7 +18,7 @@ from servoing import stage
 from servoing.arm import Arm
 from servoing.controller import Given, Servo, given_by
 from servoing.eye import Eye, object_points_m
-from servoing.feed import Feed, FeedError, feed, free_endpoint, reference_cam_T_grip, write_config
+from servoing.feed import Feed, FeedError, feed, reference_cam_T_grip, write_config
 from servoing.rules import Action
 
 WITHOUT, GRIPMON, SMOOTHED, TRUTH = "without", "gripmon", "smoothed", "truth"
