@@ -68,9 +68,12 @@ class Weigher:
         self._ends, self._lone = EndsEvidence(gripper, tracker.along), has_lone_end(gripper)
         creep = settings.smoothing
         variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month)
         self._possible = Possible(tracker, gripper, settings, from_record(reference.cam_T_grip))
         self._lasting, self._since = self._possible.lasting, since
+        taught, play = tracker.taught_at
+        if taught is None or not since.begin(taught, len(self._lasting.name), self._possible.model.parts):
+            play = (0.0,) * 6  # as if nothing were known of it: where the motion counts from would move with it
+        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month, play)
         self._newest: tuple[Measurement, float, Refits] | None = None
         self.anchor: Anchor | None = None
         self.question: Question | None = None
@@ -288,11 +291,16 @@ class Weigher:
         frames, with the numbers of the ``lasting`` hypotheses.  Of a mount that vibrates the average of the reference's
         frames and its place at their stamp differ by that.
         """
-        differences = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+        differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if differences is None:  # this frame is the first one
             return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
         staying = self._staying(knocks, displaced)
         stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
+        if fits.model.first[0] is not None and fits.model.first[0].of_images:
+            # Nobody watched the mount from these images on until the first frame.
+            staying, odds = self._usual_motion + knocks.spread, KNOCK_UNSEEN_PROBABILITY
+            unwatched = [(each._replace(prior=odds * each.prior), numbers) for each, numbers in lasting]
+            stayed += [differences.of(each, numbers, staying) for each, numbers in unwatched]
         return Doubts((*map(differences.of, now), *stayed), SIGMA_INFLATION)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
@@ -314,7 +322,7 @@ class Weigher:
     @property
     def _usual_motion(self) -> Array:
         """(6, 6) covariance of what a mount moves by since the reference's frames without a knock."""
-        return np.diag(self._mount.creep(self._since.elapsed_s) + self.swing) + self._tracker.floor
+        return np.diag(self._mount.creep(self._since.elapsed_s) + self._mount.to_and_fro) + self._tracker.floor
 
     def moved(self) -> bool:
         """Whether the anchor isn't where the reference's frames had the gripper, by more than a mount moves by itself:
@@ -441,7 +449,7 @@ class Weigher:
         if self._policy.valid_by is ValidBy.ABSOLUTE:
             doubts = fits.model.absolute([cases], cam_T_grip)
         else:
-            found = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+            found = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
             doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
         return past_alert_limit(protection_of(doubts, self._policy.integrity_risk), self._policy) is None
 
@@ -453,8 +461,12 @@ class Weigher:
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the motion since the anchor: creep and vibration."""
-        return self.swing if self.anchor is None else self._mount.creep(now_s - self.anchor.now_s) + self.swing
+        """(6,) variance of the motion since the anchor: creep, vibration and play.  Before there is one without play:
+        whether the first frames are where the reference has the gripper is asked by what that says of itself.
+        """
+        if self.anchor is None:
+            return self.swing
+        return self._mount.creep(now_s - self.anchor.now_s) + self._mount.to_and_fro
 
     def _refitted(self, measurement: Measurement, now_s: float) -> Refits:
         """The fits of a measurement, alone and with what is known of the pose.  They are kept while the same
