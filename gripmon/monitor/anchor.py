@@ -204,21 +204,24 @@ class Anchor:
 
 def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]], play: Array) -> Separation:
     """The averages (g) of frames' fits, ``rows`` (g,) of each, as shifts from a pose (4, 4): of frames whose mount
-    stood at places that scatter by standard deviations ``play`` (6,), which what each shows of the average includes.
+    stood at places that scatter by standard deviations ``play`` (6,), of which the average is off by what they are few.
     As in the anchor, errors that don't scatter don't average out; unlike there, the newest frames don't weigh more.
     """
-    each = [_chosen(fits, rows, base_T) for fits, rows in frames]
-    covariance = np.stack([fits.covariance for fits in each]) + np.diag(np.square(play))
-    weight = np.linalg.inv(covariance)
-    whole = np.linalg.inv(weight.sum(axis=0))
+    each, count, places = [_chosen(fits, rows, base_T) for fits, rows in frames], len(frames), np.diag(np.square(play))
+    own = np.stack([fits.covariance for fits in each])
+    information = np.linalg.inv(own + places)
+    weight = np.linalg.inv(information.sum(axis=0)) @ information
     shift = np.stack([fits.shift for fits in each])
-    mean = np.einsum("hij,nhjk,nhk->hi", whole, weight, shift)
-    of_model = np.einsum("hij,nhjk,nhfk->hfi", whole, weight, np.stack([fits.of_model for fits in each]))
-    variance, count = np.einsum("nhii->nhi", covariance), len(each)
-    share = np.minimum(np.square(shift - mean) / variance, MOST_SCATTER).sum(axis=0)
-    scatter = share / (count - 1 + PRIOR_FRAMES)
-    own = np.einsum("hii->hi", whole)
-    return Separation(mean, _claimed(whole, np.minimum(own * (1.0 / variance).mean(axis=0), 1.0), scatter), of_model)
+    mean = np.einsum("nhij,nhj->hi", weight, shift)
+    covariance = np.einsum("nhij,nhjk,nhlk->hil", weight, own, weight)
+    of_model = np.einsum("nhij,nhfj->hfi", weight, np.stack([fits.of_model for fits in each]))
+    variance = np.einsum("nhii->nhi", own)
+    scatter = np.minimum(np.square(shift - mean) / (variance + np.square(play)), MOST_SCATTER).sum(axis=0)
+    # Of a frame as the average has them: the surer ones weigh more.
+    usual = 1.0 / (1.0 / variance).mean(axis=0)
+    young = np.clip(np.einsum("hii->hi", covariance) / usual, 1.0 / count, 1.0)
+    claimed = _claimed(covariance, young, scatter / (count - 1 + PRIOR_FRAMES)) + places / count
+    return Separation(mean, claimed, of_model)
 
 
 def _claimed(covariance: Array, young: Array, scatter: Array) -> Array:
