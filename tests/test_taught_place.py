@@ -96,7 +96,7 @@ JUMP_M = np.array([3e-4, 0.0, 0.0])
 
 WAYS = {
     "to and fro": PLAY[np.arange(30) * 3 % 5],
-    "stays at another place": np.concatenate([PLAY[np.arange(4) % 5], np.tile(JUMP_M, (36, 1))]),
+    "stays at another place": np.concatenate([PLAY[np.arange(6) % 5], np.tile(JUMP_M, (34, 1))]),
     "stands elsewhere from the first frame on": np.tile(JUMP_M, (30, 1)),
     "a creep within the play": np.linspace(0.0, 2.0, 40)[:, None] * 0.5 * JUMP_M,
     "a knock along the fingers": PLAY[np.arange(30) * 3 % 5] + (np.arange(30) >= 12)[:, None] * 2e-3 * AXIS,
