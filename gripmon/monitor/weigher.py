@@ -294,21 +294,23 @@ class Weigher:
         differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if differences is None:  # this frame is the first one
             return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
+        first, usual = fits.model.first[0], self._usual_motion
+        moved = displaced or (first is not None and first.knocked)
         here, *knocked = map(differences.of, now)
-        staying = self._staying(knocks, displaced)
+        # Of a mount that creeps, vibrates and plays, and after a knock is where a knock moves it.
+        staying = usual + knocks.spread if moved else usual
         stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
-        if fits.model.first[0] is not None and fits.model.first[0].of_images:
+        if first is not None and first.of_images:
             # Nobody watched the mount from these images on until the first frame.  That nothing is wrong and it was
             # knocked then is among what is wrong now, which doesn't rest on its staying.
-            staying = self._usual_motion + knocks.spread
             odds = [KNOCK_UNSEEN_PROBABILITY * each.prior * (numbers > 0) for each, numbers in lasting]
             unwatched = [(each._replace(prior=prior), k) for (each, k), prior in zip(lasting, odds, strict=True)]
-            knocked += [differences.of(each, numbers, staying) for each, numbers in unwatched]
-        if len(differences.by_motion) > 1 and not displaced and not self._was_knocked:
+            knocked += [differences.of(each, numbers, usual + knocks.spread) for each, numbers in unwatched]
+        if len(differences.by_motion) > 1 and not moved:
             # A file's tilt is by the true motion, not by what noise in fits looks like: once as of a mount that moves
             # as usual, and by all that fits show as probably as it was knocked unnoticed since the reference's frames.
             odds_of_it = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
-            here, *stayed = [each._replace(usual=self._usual_motion) for each in (here, *stayed)]
+            here, *stayed = [each._replace(usual=usual) for each in (here, *stayed)]
             knocked.append(here._replace(knock=knocks.spread, odds=odds_of_it))
         return Doubts((here, *knocked, *stayed), SIGMA_INFLATION)
 
@@ -320,17 +322,6 @@ class Weigher:
         least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
-
-    def _staying(self, knocks: Knocks, displaced: bool) -> Array:
-        """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
-        vibrates, and after a knock by what a knock moves it.
-        """
-        return self._usual_motion + knocks.spread if displaced or self._was_knocked else self._usual_motion
-
-    @property
-    def _was_knocked(self) -> bool:
-        """Whether the mount was since the reference's frames, as far as is known."""
-        return self._since.current is not None and self._since.current.knocked
 
     @property
     def _usual_motion(self) -> Array:

@@ -110,18 +110,16 @@ class Mount:
         self._swing: Array = np.zeros(6)
         self.swing: Array = self._swing
         """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
+        self.to_and_fro: Array = self._play
+        """(6,) variance of where it stands from one frame to another, but for creep and knocks, m² and rad²: it
+        vibrates, and with the next pose of the arm goes on to another place of its play, however long it stood still.
+        """
 
     def learn(self, way: Array, noise: Array) -> None:
         """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
         self._swing = swinging(self._swing, way, noise)
         self.swing = np.maximum(self._swing, 0.0)
-
-    @property
-    def to_and_fro(self) -> Array:
-        """(6,) variance of where it stands from one frame to another, but for creep and knocks, m² and rad²: it
-        vibrates, and with the next pose of the arm goes on to another place of its play, however long it stood still.
-        """
-        return np.maximum(self.swing, self._play)
+        self.to_and_fro = np.maximum(self.swing, self._play)
 
     def creep(self, elapsed_s: float) -> Array:
         """(6,) variance of the slow motion in a time; a clock that was set back is no time."""
