@@ -118,7 +118,7 @@ def test_a_frames_refits_are_those_of_numpy(m: int):
     np.testing.assert_allclose(squares, expected, rtol=1e-8)
 
 
-def tables(rng: np.random.Generator, kinds: int, staying: bool) -> tuple[np.ndarray, np.ndarray]:
+def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | None) -> tuple[np.ndarray, np.ndarray]:
     """(7, n) each, compiled and NumPy's, of some fits of a pose and some of the motion since."""
     frame, first, away = fits(rng), fits(rng), shifts(rng, 1)[0]
     rows, prior = rng.integers(0, HYPOTHESES, 9), 10.0 ** rng.uniform(-4.0, 0.0, 9)
@@ -132,19 +132,22 @@ def tables(rng: np.random.Generator, kinds: int, staying: bool) -> tuple[np.ndar
     by_motion, places = 0.1 * rng.normal(size=(kinds, 6, 3)), 0.1 * rng.normal(size=(2, 3))
     motion = by_motion, shifts(rng, 1)[0], places[0], places[1], shifts(rng, 1)[0]
     known = 5.0 * covariances(rng, 1)[0] if staying else np.zeros((0, 6))
+    usual = np.zeros((0, 6)) if odds is None else covariances(rng, 1)[0]
+    true = usual, 3.0 * covariances(rng, 1)[0], odds or 0.0
     which, alike, farther = rng.integers(0, HYPOTHESES, 9), of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])
     found = np.full((2, 7, 20), np.nan)
     for by, table in zip((level_kernel, by_numpy), found, strict=True):
         by.doubted(*of, alike, farther, 1.2, 1e-2, table, 0)
         begun = by_numpy.begun(*since)
-        by.moved(*of, which, *begun, lever, *motion, known, 1.2, 1e-2, table, 10)
+        by.moved(*of, which, *begun, lever, *motion, known, *true, 1.2, 1e-2, table, 10)
     return found[0], found[1]
 
 
 @pytest.mark.parametrize("kinds", [0, 1, 3])
-@pytest.mark.parametrize("staying", [True, False])
-def test_doubts_and_those_about_the_motion_are_those_of_numpy(kinds: int, staying: bool):
-    found, expected = tables(np.random.default_rng(kinds), kinds, staying)
+@pytest.mark.parametrize(("staying", "odds"), [(True, None), (False, None), (False, 0.0), (False, 0.3)])
+def test_doubts_and_those_about_the_motion_are_those_of_numpy(kinds: int, staying: bool, odds: float | None):
+    """``odds`` of a knock, for errors by the true motion; zero: of a mount that stayed."""
+    found, expected = tables(np.random.default_rng(kinds), kinds, staying, odds)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-12)
     improbable = expected[0] <= 1e-2
     assert 0 < improbable.sum() < 18 and np.isnan(found[1:, improbable]).all()

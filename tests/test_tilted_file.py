@@ -14,6 +14,7 @@ from support.watched import pose_of, reference_of
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera
+from gripmon.model.geometry import skew
 from gripmon.model.gripper import EdgeModel, FaceModel, FingerModel, Gripper, GripperModel, PointModel, contents_of
 from gripmon.model.records import Array, ReferenceRecord, ValidBy
 from gripmon.monitor import Monitor, MonitorSettings
@@ -24,6 +25,7 @@ from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, pla
 from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, gripper_digest, own_covariance
+from gripmon.track.integrity import Cases, Doubts, Moved, Separation
 
 FILE_T = nominal_cam_T_grip(np.degrees(USUAL_TILT_RAD))
 SIDES = {"left": (-0.025, -0.013), "right": (0.013, 0.025)}
@@ -322,3 +324,50 @@ def test_two_short_flat_fingers_are_tilted_square_to_the_way_from_tip_to_tip():
     sight = placed.tcp - placed.rotation[:, 0] * float(placed.rotation[:, 0] @ placed.tcp)
     along = float(placed.rotation[:, 2] @ sight) / float(np.linalg.norm(sight))
     assert np.arccos(along) == pytest.approx(USUAL_TILT_RAD, abs=0.02) and placed.rotation[1, 2] < sight[1]
+
+
+def beyond(way: str, odds: float, risk: float, count: int = 1500) -> tuple[float, float, float]:
+    """Share of motions that are beyond their bound, of all and of mounts that were knocked (with probability ``odds``),
+    and the median bound, m, as a file whose plane is tilted by 15 degrees measures them in a view that shows little;
+    drawn from the model.
+    """
+    rng, tcp = np.random.default_rng(11), np.array([0.02, 0.03, 0.2])
+    noise, usual = (np.diag(np.square(sd)) for sd in ([1e-4, 2e-4, 7e-4, 8e-3, 7e-3, 3e-3], [2e-4] * 3 + [2e-3] * 3))
+    knock = np.diag(np.square([2.6e-3] * 3 + [0.02] * 3))
+    by_motion = np.zeros((3, 6, 3))
+    by_motion[1, (2, 3, 4, 5), (0, 1, 0, 2)] = 0.26 * np.array([1.6, 10.0, 7.5, 2.5])
+    by_motion[2, (2, 3, 4, 5), (1, 0, 1, 1)] = 0.26 * np.array([1.2, 5.0, 5.0, 2.5])
+    at_origin = np.hstack([np.eye(3), skew(tcp)])
+    none, first = np.zeros((1, 0, 6)), np.zeros(1, dtype=np.intp)
+    exact = Separation(np.zeros((1, 6)), 1e-16 * np.eye(6)[None], none)
+    cases = Cases.of(("nothing is wrong",), np.ones(1), Separation(np.zeros((1, 6)), noise[None], none))
+    found = []
+    for _ in range(count):
+        knocked = rng.uniform() < odds
+        motion = rng.multivariate_normal(np.zeros(6), usual + knock * knocked)
+        wrong = np.einsum("kij,k->ij", by_motion, rng.normal(size=3)) @ at_origin @ motion
+        error = wrong + rng.multivariate_normal(np.zeros(6), noise)
+        seen = motion + error
+        of = np.eye(6), by_motion, np.zeros(6), at_origin @ seen, tcp, -seen, np.zeros((0, 6))
+        by_fits = Moved(cases.prior, cases, first, exact, *of)
+        stayed = by_fits._replace(usual=usual)
+        sets = {
+            "by what fits show": (by_fits,),
+            "as of a mount that stays": (stayed,),
+            "by the true motion": (stayed, stayed._replace(knock=knock, odds=odds)),
+        }
+        position_m, rotation_rad, _ = Doubts(sets[way], 1.0).levels(risk)
+        within = np.linalg.norm(error[:3]) <= position_m and np.linalg.norm(error[3:]) <= rotation_rad
+        found.append((not within, knocked, position_m))
+    out, is_knocked, bound_m = np.array(found).T
+    return float(out.mean()), float(out[is_knocked > 0.0].mean()), float(np.median(bound_m))
+
+
+def test_by_the_true_motion_bounds_hold_whether_the_mount_stayed_or_was_knocked_unnoticed():
+    """They are smaller than by what noise in fits looks like; as of a mount that stays, whatever happened, wrong."""
+    risk, odds = 1e-2, 0.1
+    every, knocked, bound_m = beyond("by the true motion", odds, risk)
+    assert every <= risk and knocked <= risk / odds
+    assert bound_m < 0.85 * beyond("by what fits show", odds, risk)[2]
+    every, knocked, _ = beyond("as of a mount that stays", odds, risk)
+    assert every > 3.0 * risk and knocked > risk / odds

@@ -8,6 +8,7 @@ in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -157,10 +158,7 @@ class Anchor:
         scale = np.sqrt(np.maximum(YOUNG_VARIANCE_RATIO / young, 1.0))
         self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
         young = np.clip(young, YOUNG_VARIANCE_RATIO, 1.0)
-        # Averaging reduces persistent errors less than independent ones.
-        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT_RATIO * self._scatter)
-        scale = np.sqrt(kept / young)
-        self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
+        self._claimed = _claimed(self._filters.covariance, young, self._scatter)
         whole = Separation(self._filters.shift[:1], self._claimed[:1], self._filters.of_model[:1])
         (shift,), (covariance,), (of_model,) = self._with_origin(whole, self._base_T)
         self.cam_T_grip = perturb(self._base_T, shift)
@@ -202,6 +200,38 @@ class Anchor:
         told = telling(average, at, wander, frame, rows, CONTRADICTION_SQUARE)
         name, with_origin = self._lasting.name, self._with_origin(told, cam_T_grip, wander)
         return Cases.of(name, prior, with_origin), Cases.of(name, prior, told)
+
+
+def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]], play: Array) -> Separation:
+    """The averages (g) of frames' fits, ``rows`` (g,) of each, as shifts from a pose (4, 4): of frames whose mount
+    stood at places that scatter by standard deviations ``play`` (6,), of which the average is off by what they are few.
+    As in the anchor, errors that don't scatter don't average out; unlike there, the newest frames don't weigh more.
+    """
+    each, count, places = [_chosen(fits, rows, base_T) for fits, rows in frames], len(frames), np.diag(np.square(play))
+    own = np.stack([fits.covariance for fits in each])
+    information = np.linalg.inv(own + places)
+    weight = np.linalg.inv(information.sum(axis=0)) @ information
+    shift = np.stack([fits.shift for fits in each])
+    mean = np.einsum("nhij,nhj->hi", weight, shift)
+    covariance = np.einsum("nhij,nhjk,nhlk->hil", weight, own, weight)
+    of_model = np.einsum("nhij,nhfj->hfi", weight, np.stack([fits.of_model for fits in each]))
+    variance = np.einsum("nhii->nhi", own)
+    scatter = np.minimum(np.square(shift - mean) / (variance + np.square(play)), MOST_SCATTER).sum(axis=0)
+    # Of a frame as the average has them: the surer ones weigh more.
+    usual = 1.0 / (1.0 / variance).mean(axis=0)
+    young = np.clip(np.einsum("hii->hi", covariance) / usual, 1.0 / count, 1.0)
+    claimed = _claimed(covariance, young, scatter / (count - 1 + PRIOR_FRAMES)) + places / count
+    return Separation(mean, claimed, of_model)
+
+
+def _claimed(covariance: Array, young: Array, scatter: Array) -> Array:
+    """What averages with the covariances (g, 6, 6), of variances ``young`` (g, 6) over those of one frame, may claim:
+    averaging reduces persistent errors, all but the ``scatter`` (g, 6) of a frame's variance, less than independent
+    ones.
+    """
+    kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * scatter, LEAST_KEPT_RATIO * scatter)
+    scale = np.sqrt(kept / young)
+    return np.asarray(covariance * (scale[:, :, None] * scale[:, None, :]))
 
 
 def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import NOTHING_WRONG, Array
-from gripmon.monitor.anchor import Lasting
+from gripmon.model.poses import perturb
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Frame, ReferenceRecord, Since
+from gripmon.monitor.anchor import Lasting, average_of
 from gripmon.monitor.bounds import (
     SIGMA_INFLATION,
     UNBOUNDED_M,
@@ -20,9 +23,10 @@ from gripmon.monitor.bounds import (
     unbounded,
 )
 from gripmon.monitor.common import CommonError, Tilt
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.since import Bounds
+from gripmon.monitor.since import AtReference, Bounds, digest_of
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import Measurement, inner_edges, sides
 from gripmon.track.edges.words import in_words
@@ -77,6 +81,52 @@ class Possible:
         return self._kept[key]
 
 
+def seen_in_images(
+    tracker: Tracker,
+    gripper: Gripper,
+    settings: MonitorSettings,
+    reference: ReferenceRecord,
+    frames: Sequence[Frame],
+    play: Array,
+    taught_ns: int,
+) -> AtReferenceRecord | None:
+    """What a monitor with taught edges measures of the images that they were taught from, ``taught_ns`` (Unix ns) when,
+    on average; ``play`` (6,): standard deviations of the mount's play between them.  Where no image proves where the
+    gripper is, by its fits without the fingers' ends.  None where it is seen in none.
+    """
+    cam_T_grip = from_record(reference.cam_T_grip)
+    possible, risk = Possible(tracker, gripper, settings, cam_T_grip), settings.policy.integrity_risk
+    evidence, fits, openings_m = EndsEvidence(gripper, tracker.along), list[tuple[Refits, About]](), list[float]()
+    misread, proven = 1.0, False
+    for number, frame in enumerate(frames):
+        measurement = tracker.measure(frame, cam_T_grip, float(number))
+        if not measurement.trusted:
+            continue
+        measurement = tracker.with_known_jaw(measurement, frame.jaw_opening_m)
+        ends, about = tracker.ends(frame, measurement), possible.about(measurement.normal.edge)
+        known = _nothing_known(measurement.cam_T_grip)
+        floor = tracker.floor_of(measurement)
+        fits.append((Refits(measurement, about.hypotheses, floor, possible.model, known), about))
+        openings_m.append(measurement.jaw_opening_m)
+        own = evidence.misread(measurement, ends)
+        strictly = own * MISREAD_PROBABILITY ** strict_fingers(ends)
+        if proves(ends, elsewhere=False, again=True) or (ends.at_each and within(strictly, risk)):
+            own, proven = strictly, True
+        misread = min(misread, own)
+    if not fits:
+        return None
+    of_each = [(own if proven else own.under(about.without_ends), about.rows) for own, about in fits]
+    average = average_of(cam_T_grip, of_each, play)
+    seen_T = perturb(cam_T_grip, average.shift[0])
+    of = average._replace(shift=average.shift - average.shift[0])
+    at = seen_T, of, float(np.mean(openings_m)), len(fits), Since.REFERENCE, taught_ns, misread, proven
+    return AtReference(*at, of_images=True).record(reference.reference_id, digest_of(tracker.measured_as))
+
+
+def _nothing_known(cam_T_grip: Array) -> Known:
+    return Known(cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
+
+
 def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement) -> Bounds:
     """The protection levels of a single frame with the given measurement and proven fingers' ends, where the frames of
     the reference show no more.
@@ -86,8 +136,8 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     cam_T_grip = measurement.cam_T_grip
     possible = Possible(tracker, gripper, settings, measurement.prediction.cam_T_grip)
     hypotheses = possible.hypotheses(measurement.normal.edge)
-    nothing = Known(cam_T_grip, np.diag([UNBOUNDED_M**2] * 3 + [UNBOUNDED_RAD**2] * 3), np.zeros((1, 6)))
-    fits = Refits(measurement, hypotheses, tracker.floor_of(measurement), possible.model, nothing)
+    known, floor = _nothing_known(cam_T_grip), tracker.floor_of(measurement)
+    fits = Refits(measurement, hypotheses, floor, possible.model, known)
     cases = fits.cases(fits.away(cam_T_grip), hypotheses.prior, ~hypotheses.sudden)
     absolute, risk = possible.model.absolute([cases], cam_T_grip), settings.policy.integrity_risk
     since = Doubts((as_uncertain_again(cases),), SIGMA_INFLATION)

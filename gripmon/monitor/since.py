@@ -142,7 +142,8 @@ class AtReference(NamedTuple):
     """What the monitor measured at the reference: ``fits`` under each of g lasting hypotheses as shifts from
     ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
     ``misread``: probability that what looked like the fingers' ends in all of these was something else; ``proven``:
-    whether one of them proved the pose; ``knocked``: whether the mount was, later on.
+    whether one of them proved the pose; ``knocked``: whether the mount was, later on.  ``of_images``: they are images
+    to teach from, each at another place of the mount's play: it is their average that a motion counts from.
     """
 
     cam_T_grip: Array
@@ -154,6 +155,36 @@ class AtReference(NamedTuple):
     misread: float
     proven: bool
     knocked: bool = False
+    of_images: bool = False
+
+    @classmethod
+    def of_record(cls, record: AtReferenceRecord, lasting: int, fingers: int) -> AtReference | None:
+        """As kept; None if that has another number of hypotheses or fingers, or no numbers."""
+        fits = _fits(record, lasting, fingers)
+        if fits is None:
+            return None
+        at = from_record(record.cam_T_grip), fits, record.jaw_opening_m, record.frames, record.since, record.since_ns
+        return cls(*at, record.misread, record.proven, record.knocked, record.of_images)
+
+    def record(self, reference_id: str, measured_as: str) -> AtReferenceRecord:
+        """To be kept."""
+        shift, covariance, of_model = (np.ascontiguousarray(each, dtype="<f8").tobytes() for each in self.fits)
+        return AtReferenceRecord(
+            reference_id,
+            measured_as,
+            to_record(self.cam_T_grip),
+            shift,
+            covariance,
+            of_model,
+            self.jaw_opening_m,
+            self.frames,
+            self.since,
+            self.since_ns,
+            self.misread,
+            self.proven,
+            self.knocked,
+            self.of_images,
+        )
 
     def motion(self, cam_T_grip: Array) -> Array:
         """exp(d) (4, 4) of a measured pose (4, 4)."""
@@ -171,7 +202,7 @@ class AtReference(NamedTuple):
         which a mount that vibrates differs from its average.
         """
         lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
-        more, travel, by_motion = np.diag(swing), np.zeros(6), np.zeros((0, 6, 3))
+        more, travel, by_motion = np.diag(swing) * (not self.of_images), np.zeros(6), np.zeros((0, 6, 3))
         if common is not None:
             travel_m = opened.jaw_opening_m - self.jaw_opening_m
             more = common.of_motion(motion, self.cam_T_grip) + more
@@ -183,6 +214,11 @@ class AtReference(NamedTuple):
         return Differences(first, lever, by_motion, travel, motion[:3, 3].copy(), at_T[:3, 3].copy(), unmoved)
 
 
+def digest_of(measured_as: tuple[object, ...]) -> str:
+    """What a measured pose depends on besides gripper and camera, as :class:`AtReferenceRecord` has it."""
+    return hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
+
+
 class AtReferences:
     """What was measured at each reference, of one monitor, and at the one in force."""
 
@@ -191,7 +227,7 @@ class AtReferences:
         on besides gripper and camera.
         """
         self._valid_by = valid_by
-        self._digest = hashlib.sha256(msgspec.json.encode(measured_as)).hexdigest()[:16]
+        self._digest = digest_of(measured_as)
         self._known: dict[str, AtReference] = {}
         self.current: AtReference | None = None
         """At the reference in force; None until a frame proves a pose."""
@@ -309,46 +345,36 @@ class AtReferences:
     def state(self) -> tuple[AtReferenceRecord, ...]:
         """What survives a restart: without an average that is still growing, which begins anew."""
         growing = self._id if self._growing is not None else None
-        return tuple(self._record(name, at) for name, at in self._known.items() if name != growing)
+        return tuple(at.record(name, self._digest) for name, at in self._known.items() if name != growing)
 
-    def _record(self, reference_id: str, at: AtReference) -> AtReferenceRecord:
-        shift, covariance, of_model = (np.ascontiguousarray(each, dtype="<f8").tobytes() for each in at.fits)
-        return AtReferenceRecord(
-            reference_id,
-            self._digest,
-            to_record(at.cam_T_grip),
-            shift,
-            covariance,
-            of_model,
-            at.jaw_opening_m,
-            at.frames,
-            at.since,
-            at.since_ns,
-            at.misread,
-            at.proven,
-            at.knocked,
-        )
+    def begin(self, taught: AtReferenceRecord, lasting: int, fingers: int) -> bool:
+        """Count the motion since the reference in force from the images that edges were taught from, with these numbers
+        of lasting hypotheses and fingers.  Returns whether that is possible: not if they were measured otherwise.
+        """
+        at = AtReference.of_record(taught, lasting, fingers) if taught.measured_as == self._digest else None
+        if at is not None:
+            self._known[self._id] = self.current = at
+        return at is not None
 
     def restore(self, records: Iterable[AtReferenceRecord], lasting: int, fingers: int) -> str | None:
         """Go on with what an earlier run measured, with these numbers of lasting hypotheses and fingers.  Returns why
         some of it isn't used: settings or taught edges have changed since; None if all of it is.
         """
         refused, right = None, "the motion since the reference counts from the next 30 frames that prove where it is"
-        if self._id not in {each.reference_id for each in records}:
+        if self._id not in {*self._known, *(each.reference_id for each in records)}:
             refused = (
                 "the state has nothing of the reference's frames: it is from an earlier version, or too few frames had "
                 f"proved where the gripper is; {right}, or recalibrate"
             )
         for each in records:
-            fits = _fits(each, lasting, fingers) if each.measured_as == self._digest else None
-            if fits is None:
+            at = AtReference.of_record(each, lasting, fingers) if each.measured_as == self._digest else None
+            if at is not None:
+                self._known[each.reference_id] = at
+            elif each.reference_id not in self._known:
                 refused = (
                     "where the reference's frames had the gripper isn't used: the edges were taught again, or measured "
                     f"with other settings, since; {right}, or recalibrate"
                 )
-            else:
-                at = from_record(each.cam_T_grip), fits, each.jaw_opening_m, each.frames, each.since, each.since_ns
-                self._known[each.reference_id] = AtReference(*at, each.misread, each.proven, each.knocked)
         self.current = self._known.get(self._id)
         return refused
 

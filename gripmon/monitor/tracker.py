@@ -133,8 +133,13 @@ class Tracker:
         """(k, 6) error of the reference that taught edges have in them, by a standard deviation along k directions."""
         self.taught_offset: Array = np.zeros(6) if taught is None else taught.reference_offset
         """(6,) how far off that reference the gripper appeared in the teaching images."""
-        self.taught_digest = "" if taught is None else taught.digest
-        """Digest of the taught edges; empty without any."""
+        self.taught_at = (None, (0.0,) * 6) if taught is None else (taught.at_reference, taught.play)
+        """What was measured of the teaching images, if anything, and the mount's play (6,) between them, standard
+        deviations, m and rad.
+        """
+        digest = "" if taught is None else taught.digest
+        self.measured_as = digest, settings.corners, settings.measurement, settings.jaw_sigma_m
+        """What a measured pose depends on besides gripper and camera; the taught edges by their digest."""
         self._jaw_opening_m = gripper.jaw_nominal_m  # as measured last
         self._usual_share = USUAL_SHARE
         self._shown_frames = np.ones(len(gripper.edge_ids))

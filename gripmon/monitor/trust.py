@@ -55,8 +55,8 @@ class Integrity:
         reference: ReferenceRecord,
     ):
         self._tracker, self._policy = tracker, settings.policy
-        measured_as = tracker.taught_digest, settings.corners, settings.measurement, settings.jaw_sigma_m
-        self.since = AtReferences(reference, settings.policy.valid_by, settings.policy.integrity_risk, measured_as)
+        policy = settings.policy
+        self.since = AtReferences(reference, policy.valid_by, policy.integrity_risk, tracker.measured_as)
         """What was measured at the reference in force."""
         self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
         # Fingers without a direction of their own are slid out of the gripper.

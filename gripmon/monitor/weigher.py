@@ -68,9 +68,12 @@ class Weigher:
         self._ends, self._lone = EndsEvidence(gripper, tracker.along), has_lone_end(gripper)
         creep = settings.smoothing
         variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month)
         self._possible = Possible(tracker, gripper, settings, from_record(reference.cam_T_grip))
         self._lasting, self._since = self._possible.lasting, since
+        taught, play = tracker.taught_at
+        if taught is None or not since.begin(taught, len(self._lasting.name), self._possible.model.parts):
+            play = (0.0,) * 6  # as if nothing were known of it: where the motion counts from would move with it
+        self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month, play)
         self._newest: tuple[Measurement, float, Refits] | None = None
         self.anchor: Anchor | None = None
         self.question: Question | None = None
@@ -288,12 +291,28 @@ class Weigher:
         frames, with the numbers of the ``lasting`` hypotheses.  Of a mount that vibrates the average of the reference's
         frames and its place at their stamp differ by that.
         """
-        differences = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+        differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if differences is None:  # this frame is the first one
             return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
-        staying = self._staying(knocks, displaced)
+        first, usual = fits.model.first[0], self._usual_motion
+        moved = displaced or (first is not None and first.knocked)
+        here, *knocked = map(differences.of, now)
+        # Of a mount that creeps, vibrates and plays, and after a knock is where a knock moves it.
+        staying = usual + knocks.spread if moved else usual
         stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
-        return Doubts((*map(differences.of, now), *stayed), SIGMA_INFLATION)
+        if first is not None and first.of_images:
+            # Nobody watched the mount from these images on until the first frame.  That nothing is wrong and it was
+            # knocked then is among what is wrong now, which doesn't rest on its staying.
+            odds = [KNOCK_UNSEEN_PROBABILITY * each.prior * (numbers > 0) for each, numbers in lasting]
+            unwatched = [(each._replace(prior=prior), k) for (each, k), prior in zip(lasting, odds, strict=True)]
+            knocked += [differences.of(each, numbers, usual + knocks.spread) for each, numbers in unwatched]
+        if len(differences.by_motion) > 1 and not moved:
+            # A file's tilt is by the true motion, not by what noise in fits looks like: once as of a mount that moves
+            # as usual, and by all that fits show as probably as it was knocked unnoticed since the reference's frames.
+            odds_of_it = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
+            here, *stayed = [each._replace(usual=usual) for each in (here, *stayed)]
+            knocked.append(here._replace(knock=knocks.spread, odds=odds_of_it))
+        return Doubts((here, *knocked, *stayed), SIGMA_INFLATION)
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
@@ -304,17 +323,10 @@ class Weigher:
         near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
         return Knocks.of(least_known if near else axis)
 
-    def _staying(self, knocks: Knocks, displaced: bool) -> Array:
-        """(6, 6) covariance of the motion since the reference's frames that isn't excluded: of a mount that creeps and
-        vibrates, and after a knock by what a knock moves it.
-        """
-        moved = displaced or (self._since.current is not None and self._since.current.knocked)
-        return self._usual_motion + knocks.spread if moved else self._usual_motion
-
     @property
     def _usual_motion(self) -> Array:
         """(6, 6) covariance of what a mount moves by since the reference's frames without a knock."""
-        return np.diag(self._mount.creep(self._since.elapsed_s) + self.swing) + self._tracker.floor
+        return np.diag(self._mount.creep(self._since.elapsed_s) + self._mount.to_and_fro) + self._tracker.floor
 
     def moved(self) -> bool:
         """Whether the anchor isn't where the reference's frames had the gripper, by more than a mount moves by itself:
@@ -441,7 +453,7 @@ class Weigher:
         if self._policy.valid_by is ValidBy.ABSOLUTE:
             doubts = fits.model.absolute([cases], cam_T_grip)
         else:
-            found = fits.model.differences(cam_T_grip, fits.opened, self.swing)
+            found = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
             doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
         return past_alert_limit(protection_of(doubts, self._policy.integrity_risk), self._policy) is None
 
@@ -453,8 +465,12 @@ class Weigher:
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
 
     def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the motion since the anchor: creep and vibration."""
-        return self.swing if self.anchor is None else self._mount.creep(now_s - self.anchor.now_s) + self.swing
+        """(6,) variance of the motion since the anchor: creep, vibration and play.  Before there is one without play:
+        whether the first frames are where the reference has the gripper is asked by what that says of itself.
+        """
+        if self.anchor is None:
+            return self.swing
+        return self._mount.creep(now_s - self.anchor.now_s) + self._mount.to_and_fro
 
     def _refitted(self, measurement: Measurement, now_s: float) -> Refits:
         """The fits of a measurement, alone and with what is known of the pose.  They are kept while the same

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import cv2
 import msgspec
+import numpy as np
 
 from gripmon import __version__
 from gripmon.io.sources.files import TIMESTAMPS_NAME, opening_beside
@@ -21,10 +22,10 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
-from gripmon.model.records import Frame, Image, ReferenceRecord
+from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.model.response import Response, ResponseSeen, response_of
 from gripmon.model.yaml_text import as_yaml
-from gripmon.monitor import MonitorSettings
+from gripmon.monitor import MonitorSettings, Tracker, seen_in_images
 from gripmon.teach.drawing import draw_taught
 from gripmon.teach.kept import Kept, as_frames, kept, with_help
 from gripmon.teach.measure import Taught
@@ -162,8 +163,24 @@ def taught_from(
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures
     ]
     taught = teach_images(rig, reference, shown)
-    model = _model(taught, rig, reference, pictures, command, data)
-    return Teaching(taught, model, rig, reference, tuple(taught.used(shown)), response)
+    model, used = _model(taught, rig, reference, pictures, command, data), tuple(taught.used(shown))
+    model = _with_what_is_seen(model, rig, reference, as_frames(used), taught.play)
+    return Teaching(taught, model, rig, reference, used, response)
+
+
+def _with_what_is_seen(
+    model: TaughtModel, rig: Rig, reference: ReferenceRecord, frames: Sequence[Frame], play: Array
+) -> TaughtModel:
+    """The model with where a monitor that knows it sees the gripper in its images: what a motion counts from."""
+    edges = TaughtEdges.of_model(model, rig.gripper, own_covariance(reference, rig.gripper))
+    tracker = Tracker(rig.camera, rig.gripper, rig.settings, edges)
+    taught_ns = 1_000_000_000 * int(datetime.fromisoformat(model.provenance.time).timestamp())
+    seen = seen_in_images(tracker, rig.gripper, rig.settings, reference, frames, play, taught_ns)
+    if seen is None:
+        return model
+    x, y, z, about_x, about_y, about_z = np.round(play, 9).tolist()
+    known = msgspec.structs.replace(model.reference, play=(x, y, z, about_x, about_y, about_z), seen=seen)
+    return msgspec.structs.replace(model, reference=known)
 
 
 def told_response(pictures: Sequence[Picture], asked: str, configured: Response | None) -> ResponseSeen:
@@ -274,6 +291,9 @@ _HEADER = """\
 #                       along and about the camera's axes (m, rad); every bound includes it
 #   reference.images_covariance  how well the images show where the gripper was, 6 x 6 row by row; with the covariance
 #                       of the configured reference it is what absolute bounds include of the reference's error
+#   reference.play      standard deviations of where one image has the gripper from another, by the play of mount and
+#                       fingers: along and about the camera's axes (m, rad)
+#   reference.seen      where a monitor sees the gripper in the images: what the motion since the reference counts from
 #   edges.*.share       the part of the edge that was seen, between its `from` (0) and its `to` (1)
 #   edges.*.offset_m    how far the edge shows beside the sharp model's at the two ends of that part, across the line of
 #                       sight, positive to the right of someone who walks along it in the image (m); sigma_m: its

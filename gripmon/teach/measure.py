@@ -21,7 +21,7 @@ from scipy.stats import norm
 
 from gripmon.judge.smoothing import GATE_SQUARE
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.records import ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.estimate import (
     PLAUSIBLE_OWN_M,
     SHAPE_M,
@@ -65,8 +65,9 @@ class Taught:
 
     ``closure_px``: largest distance of the gripper from where it stands when the images are measured with what was
     taught.  ``reference_offset`` (6,): the perturbation from the reference to the gripper in the images, as far as
-    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``left_out``: the
-    images that contradict the others, by their numbers, and why.
+    bevels don't explain it, with ``reference_covariance`` (36,) of how well the images show it.  ``play`` (6,):
+    standard deviations of where one image has the gripper from another, m and rad.  ``left_out``: the images that
+    contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -76,6 +77,7 @@ class Taught:
     closure_px: float
     reference_offset: PoseOffset
     reference_covariance: tuple[float, ...]
+    play: Array
     left_out: dict[int, str]
 
     def used(self, images: Sequence[T]) -> list[T]:
@@ -153,7 +155,7 @@ def _elsewhere(viewer: Viewer, image: TeachingImage, found: Measurement) -> Imag
 def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
     gripper = viewer.gripper
     views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
-    images = with_play(viewer, views)
+    images, play = with_play(viewer, views)
     if any(image.play is not None for image in images):
         views = [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)]
     lines, untaught = _lines(viewer, views, search=True)
@@ -180,6 +182,7 @@ def _teach(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measu
         round(_closure_px(viewer, images, arrays), 4),
         reference.offset,
         reference.covariance,
+        play,
         {},
     )
 

@@ -44,8 +44,9 @@ _FEWEST_SHARED = 4
 _ROUNDS, _SETTLING = 4, 10
 
 
-def with_play(viewer: Viewer, views: Sequence[View]) -> list[TeachingImage]:
-    """The images, each with its play where it has more than noise explains.  Raises
+def with_play(viewer: Viewer, views: Sequence[View]) -> tuple[list[TeachingImage], Array]:
+    """The images, each with its play where it has more than noise explains, and standard deviations (6,) of the play
+    between them, m and rad: of what they show, and of what they don't; zeros where noise explains all.  Raises
     :class:`~gripmon.teach.views.ImageRefused` for the image that is farthest from the others, if it is too far for play
     or its edges don't move together.
     """
@@ -54,21 +55,28 @@ def with_play(viewer: Viewer, views: Sequence[View]) -> list[TeachingImage]:
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(places_px).all(axis=2))
     enough = seen.sum(axis=1) >= _FEWEST_SHARED
     if len(views) < 2 or not enough.any():
-        return images
-    prior = _prior(viewer)
+        return images, np.zeros(6)
+    prior, unsure = _prior(viewer), np.zeros((len(views), 6))
     play, noise_px, sure = np.zeros((len(views), 6)), SINGLE_SIGMA_PX, 0.0
     for _ in range(_ROUNDS):
         common_px = np.nanmedian(places_px - np.einsum("nekm,nm->nek", rows, play), axis=0)
         for number in np.flatnonzero(enough).tolist():
             own = seen[number]
-            play[number] = _moved((places_px[number] - common_px)[own], rows[number, own], noise_px, prior, sure)
+            off_px = (places_px[number] - common_px)[own]
+            play[number], unsure[number] = _moved(off_px, rows[number, own], noise_px, prior, sure)
         play[enough] -= play[enough].mean(axis=0)
         rest_px = places_px - common_px - np.einsum("nekm,nm->nek", rows, play)
         # The scatter that no play explains, from the first round, in which every image may have some.
         noise_px = max(1.4826 * float(np.nanmedian(np.abs(rest_px[enough]))), SINGLE_SIGMA_PX) if not sure else noise_px
         sure = SURE
     _refuse(views, rest_px, np.einsum("nekm,nm->nek", rows, play), enough)
-    return [replace(image, play=own if own.any() else None) for image, own in zip(images, play, strict=True)]
+    images = [replace(image, play=own if own.any() else None) for image, own in zip(images, play, strict=True)]
+    own, unsure = play[enough], unsure[enough]
+    if not unsure.any():
+        return images, np.zeros(6)
+    # The play that the images have, as far as each shows its own, and the variance of what it doesn't show of it.
+    spread = np.square(own - own.mean(axis=0)).sum(axis=0) / max(len(own) - 1, 1)
+    return images, np.sqrt(spread + unsure.mean(axis=0))
 
 
 def _places(viewer: Viewer, views: Sequence[View]) -> tuple[Array, Array]:
@@ -98,18 +106,19 @@ def _prior(viewer: Viewer) -> Array:
     return np.diag(np.square([1.0 / PLAY_M] * 3 + [lever_m / PLAY_M] * 3))
 
 
-def _moved(off_px: Array, rows: Array, noise_px: float, prior: Array, sure: float) -> Array:
-    """The motion (6,) that explains most of an image's deviations (e, 2), by Huber's weights; zero where it reduces
-    their squares, over their noise, by less than ``sure``.
+def _moved(off_px: Array, rows: Array, noise_px: float, prior: Array, sure: float) -> tuple[Array, Array]:
+    """The motion (6,) that explains most of an image's deviations (e, 2), by Huber's weights, and its variances (6,);
+    zeros where it reduces their squares, over their noise, by less than ``sure``.
     """
     y, design = off_px.ravel() / noise_px, rows.reshape(-1, 6) / noise_px
     motion, weight = np.zeros(6), np.ones(len(y))
     for _ in range(_SETTLING):
-        motion = np.linalg.solve(design.T @ (weight[:, None] * design) + prior, design.T @ (weight * y))
+        information = design.T @ (weight[:, None] * design) + prior
+        motion = np.linalg.solve(information, design.T @ (weight * y))
         rest = np.abs(y - design @ motion)
         weight = HUBER / np.maximum(rest, HUBER)
     explained = float(weight @ (np.square(y) - np.square(y - design @ motion)))
-    return motion if explained > sure else np.zeros(6)
+    return (motion, np.linalg.inv(information).diagonal()) if explained > sure else (np.zeros(6), np.zeros(6))
 
 
 def _refuse(views: Sequence[View], rest_px: Array, play_px: Array, enough: NDArray[np.bool_]) -> None:

@@ -82,7 +82,8 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     since_ns: Annotated[
         int,
         Meta(
-            description="stamp of the newest of its own frames, or of the middle one of the first proved ones, Unix ns"
+            description="stamp of the newest of its own frames, or of the middle one of the first proved ones, Unix "
+            "ns; of images to teach from when they were taught from"
         ),
     ]
     misread: Annotated[
@@ -90,6 +91,9 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     ]
     proven: Annotated[bool, Meta(description="whether one of them proved the pose by the fingers' ends")]
     knocked: Annotated[bool, Meta(description="whether the mount was knocked later on")]
+    of_images: Annotated[
+        bool, Meta(description="whether these were images to teach from, each at another place of the mount's play")
+    ] = False
 
 
 class MonitorState(msgspec.Struct, frozen=True):

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, NamedTuple
 
 import msgspec
@@ -29,7 +29,7 @@ from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.gripper.core import POLARITY
-from gripmon.model.records import Array, ReferenceRecord, Transform
+from gripmon.model.records import Array, AtReferenceRecord, ReferenceRecord, Transform
 from gripmon.track.edges.settings import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
@@ -73,13 +73,17 @@ class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The reference that was taught at; ``offset``: the perturbation (6,) from it to the gripper in the images, as far
     as bevels don't explain it (m, rad); ``images_covariance`` (36,), 6 x 6 row by row: how well the images alone show
-    where the gripper is, None in files of earlier versions.
+    where the gripper is, None in files of earlier versions.  ``seen``: where a monitor that knows the edges sees the
+    gripper in the images, on average, and ``play`` (6,), standard deviations from image to image (m, rad); without
+    either where too little was seen, and in files of earlier versions.
     """
 
     id: str
     cam_T_grip: Transform
     offset: PoseOffset = (0.0,) * 6
     images_covariance: Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)] | None = None
+    play: PoseOffset = (0.0,) * 6
+    seen: AtReferenceRecord | None = None
 
 
 class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -206,7 +210,9 @@ class TaughtEdges:
     offsets have in them: one standard deviation along each of k directions, m and rad, given both the reference's own
     covariance and what the teaching images show of where the gripper was.
     ``reference_offset`` (6,): how far off that reference the gripper appeared in the teaching images, m and rad; all
-    poses are off by as much if the camera moved since the calibration.
+    poses are off by as much if the camera moved since the calibration.  ``at_reference``: what a monitor measures of
+    these images, and the mount's ``play`` (6,) between them, standard deviations, m and rad; None and zeros where that
+    isn't known.
     """
 
     known: NDArray[np.bool_]
@@ -221,6 +227,8 @@ class TaughtEdges:
     usual_m: Array
     reference_error: Array
     reference_offset: Array
+    at_reference: AtReferenceRecord | None = None
+    play: PoseOffset = (0.0,) * 6
 
     @classmethod
     def of(
@@ -269,7 +277,8 @@ class TaughtEdges:
         openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
         opening_m = float(np.mean(openings)) if openings else None
         at, shown = taught_pose(model), model.reference
-        return cls.of(model.edges, gripper, at, opening_m, covariance, shown.offset, shown.images_covariance)
+        edges = cls.of(model.edges, gripper, at, opening_m, covariance, shown.offset, shown.images_covariance)
+        return replace(edges, at_reference=shown.seen, play=shown.play)
 
     @property
     def digest(self) -> str:

@@ -75,7 +75,7 @@ def _inverse(matrix: Array, inverse: Array, root: Array, upper: Array) -> bool:
 
 
 @compiled
-def _square(covariance: Array, values: Array, root: Array, white: Array) -> float:
+def square(covariance: Array, values: Array, root: Array, white: Array) -> float:
     """Normalised square v' C^-1 v of ``values`` (m,) by their covariance (m, m), as :func:`_inverse` has it; ``root``
     and ``white`` (m,) are overwritten.
     """
@@ -235,7 +235,7 @@ def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float
     out, root, white, both = np.empty(len(shift)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for h in range(len(shift)):
         between(covariance[h], off[h], more, other, times, both)
-        out[h] = _square(both, shift[h] - at, root, white)
+        out[h] = square(both, shift[h] - at, root, white)
     return out
 
 
@@ -435,7 +435,7 @@ def jumped(
                 for i in range(6):
                     for j in range(6):
                         both[i, j] = apart[i, j] + (jumps[c, i, j] if c < kinds else 0.0)
-                log_density[c] = -0.5 * _square(both, shift[h] - at, root, white)
+                log_density[c] = -0.5 * square(both, shift[h] - at, root, white)
                 for i in range(6):
                     log_density[c] += math.log(root[i, i])
             highest = max(highest, log_density[c])
@@ -595,6 +595,6 @@ def telling(
             continue
         own = of_frame[h, 0, 0] + of_frame[h, 1, 1] + of_frame[h, 2, 2]
         surer = own < spread[g, 0, 0] + spread[g, 1, 1] + spread[g, 2, 2]
-        if surer or _square(of_frame[h] + spread[g], shift[h] - away[g], root, white) > limit:
+        if surer or square(of_frame[h] + spread[g], shift[h] - away[g], root, white) > limit:
             away[g], spread[g], error[g] = shift[h], of_frame[h], of_model[h]
     return away, spread, error

@@ -10,6 +10,7 @@ show has its own share, so that it isn't taken for improbable because it is spec
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -100,17 +101,25 @@ def swinging(swing: Array, way: Array, noise: Array) -> Array:
 class Mount:
     """The motions that one mount is expected to make."""
 
-    def __init__(self, creep: Array, jumps_per_month: float):
-        """``creep`` (6,): variance that its slow motion grows by in a second, m² and rad²."""
+    def __init__(self, creep: Array, jumps_per_month: float, play: Sequence[float]):
+        """``creep`` (6,): variance that its slow motion grows by in a second, m² and rad²; ``play`` (6,): standard
+        deviations of where it stands, to and fro, from one pose of the arm to another, m and rad.
+        """
         self._creep, self._jumps_per_s = creep, jumps_per_month / (30.0 * 86_400.0)
+        self._play: Array = np.square(play)
         self._swing: Array = np.zeros(6)
         self.swing: Array = self._swing
         """(6,) variance of the way between proven poses that their errors don't explain, m² and rad²: vibration."""
+        self.to_and_fro: Array = self._play
+        """(6,) variance of where it stands from one frame to another, but for creep and knocks, m² and rad²: it
+        vibrates, and with the next pose of the arm goes on to another place of its play, however long it stood still.
+        """
 
     def learn(self, way: Array, noise: Array) -> None:
         """Learn the vibration from the ``way`` (6,) between two proven poses, ``noise`` (6,) as :func:`swinging`."""
         self._swing = swinging(self._swing, way, noise)
         self.swing = np.maximum(self._swing, 0.0)
+        self.to_and_fro = np.maximum(self.swing, self._play)
 
     def creep(self, elapsed_s: float) -> Array:
         """(6,) variance of the slow motion in a time; a clock that was set back is no time."""

@@ -15,7 +15,7 @@ import numpy as np
 from gripmon.model.compiled import compiled
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
-from gripmon.track.integrity.kernel import Ints, join
+from gripmon.track.integrity.kernel import Ints, join, square
 
 MOST_SIGMAS = 2.0
 """Standard deviations by which what is of second order is off at most: a plane's tilt is known to 15 degrees, and
@@ -337,6 +337,61 @@ def _levered(covariance: Array, lever: Array, out: Array) -> None:
 
 
 @compiled
+def _stayed(
+    way: Array,
+    scatter: Array,
+    error: Array,
+    stays_at: Array,
+    usual: Array,
+    knock: Array,
+    odds: float,
+    mean: Array,
+    covariance: Array,
+    work: Array,
+) -> float:
+    """A true motion, ``mean`` (6,) with its ``covariance`` (6, 6), by what fits say of it, ``way`` (6,) but for a
+    ``scatter`` (6, 6) and the errors (f, 6), and by what a mount that isn't knocked moves, the covariance ``usual``
+    (6, 6) about ``stays_at`` (6,).  Returns the probability, by Bayes, that it was knocked, with ``knock`` (6, 6)
+    besides, of ``odds`` before; no less than these.
+    """
+    whole, root, white, apart = scatter.copy(), np.empty((6, 6)), np.empty(6), np.empty(6)
+    for f in range(len(error)):
+        for i in range(6):
+            for j in range(6):
+                whole[i, j] += error[f, i] * error[f, j]
+    for i in range(6):
+        apart[i] = way[i] - stays_at[i]
+    none = np.zeros((0, 6))
+    join(way, whole, none, (stays_at, usual, none), (mean, covariance, none), work)
+    log_density = np.empty(2)
+    for k in range(2):
+        both = whole + usual if k == 0 else whole + usual + knock
+        log_density[k] = -0.5 * square(both, apart, root, white)
+        for i in range(6):
+            log_density[k] += math.log(root[i, i])
+    likelier = math.exp(min(log_density[1] - log_density[0], 700.0)) * odds
+    return max(odds, likelier / (likelier + 1.0 - odds))
+
+
+@compiled
+def _by_origin(by_motion: Array, covariance: Array, at: Array, out: Array) -> None:
+    """``out`` (6, 6) += B O B' of the errors B by a motion of the camera's origin, ``by_motion`` (k, 6, 3), with the
+    covariance O of that of a motion with a ``covariance`` (6, 6) and the TCP ``at`` (3,).
+    """
+    lever, half = np.zeros((3, 6)), np.zeros((3, 6))
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        lever[i, i], lever[i, 3 + a], lever[i, 3 + b] = 1.0, -at[b], at[a]
+    origin = lever @ covariance @ lever.T
+    for m in range(len(by_motion)):
+        half = by_motion[m] @ origin
+        for i in range(6):
+            for j in range(6):
+                for k in range(3):
+                    out[i, j] += half[i, k] * by_motion[m, j, k]
+
+
+@compiled
 def moved(
     shift: Array,
     covariance: Array,
@@ -356,6 +411,9 @@ def moved(
     tcp: Array,
     stays_at: Array,
     staying: Array,
+    usual: Array,
+    knock: Array,
+    odds: float,
     inflation: float,
     share: float,
     table: Array,
@@ -367,13 +425,17 @@ def moved(
     as for :func:`_by_motion`, ``origin`` (3,) the way of the camera's origin.
 
     ``staying`` (6, 6): covariance of a motion from ``stays_at`` (6,) that is known besides, :func:`join`; (0, 6): none.
+
+    ``usual`` (6, 6), where it isn't (0, 6): errors ``by_motion`` are by the true motion, of a mount that moves from
+    ``stays_at`` by that covariance, or, with ``odds`` above zero, was knocked by ``knock`` (6, 6) as well, of a
+    probability by these, :func:`_stayed`: then they are by all of what fits show.
     """
     parts, kinds = off.shape[1], len(by_motion)
     errors = parts + kinds * kinds + kinds
     apart, spread, half, none = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.zeros((0, 6))
     way, scatter, error = np.empty(6), np.empty((6, 6)), np.empty((errors, 6))
     joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((5, 6, 6))
-    exact = np.zeros((errors, 6))
+    exact, true_way, unsure = np.zeros((errors, 6)), np.empty(6), np.empty((6, 6))
     before = -1
     for r in range(len(rows)):
         h, g, number = rows[r], which[r], first + r
@@ -401,7 +463,17 @@ def moved(
                 for i in range(3):
                     for k in range(3, 6):
                         error[f, i] += lever[i, k] * off[h, f, k]
-        _by_motion(by_motion, travel, origin, tcp, way, error[parts:])
+        of_motion = way
+        if len(usual):
+            knocked = _stayed(way, scatter, error[:parts], stays_at, usual, knock, odds, true_way, unsure, work)
+            if odds > 0.0:
+                table[0, number] *= knocked
+                if table[0, number] <= share:
+                    continue
+            else:
+                of_motion = true_way
+                _by_origin(by_motion, unsure, tcp, scatter)
+        _by_motion(by_motion, travel, origin, tcp, of_motion, error[parts:])
         if len(staying):
             join(way, scatter, error, (stays_at, staying, exact), joined, work)
             _enter(joined[0], joined[1], joined[2], none, inflation, table, number)

@@ -250,7 +250,8 @@ class Moved(NamedTuple):
     """The same about the motion since the reference: fits have ``begun`` there under g hypotheses, of which each of the
     ``cases``, with their ``prior`` (r,), goes with its own, ``which`` (r,).  ``lever`` (6, 6), ``by_motion`` (k, 6, 3),
     ``travel`` (6,), ``origin`` (3,), ``tcp`` (3,) and ``stays_at`` (6,) as for :func:`level_kernel.moved`; ``staying``
-    (6, 6): how far a mount moves that stays; (0, 6) where the fits contain that.
+    (6, 6): how far a mount moves that stays; (0, 6) where the fits contain that.  ``usual`` (6, 6), ``knock`` (6, 6)
+    and ``odds``: of the true motion that errors ``by_motion`` are by, as for :func:`level_kernel.moved`.
     """
 
     prior: Array
@@ -264,13 +265,17 @@ class Moved(NamedTuple):
     tcp: Array
     stays_at: Array
     staying: Array
+    usual: Array = np.zeros((0, 6))
+    knock: Array = np.zeros((6, 6))
+    odds: float = 0.0
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.moved`."""
         prior, _, _, rows, fits, away, more, *_ = self.cases
         since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
+        true = self.usual, self.knock, self.odds
         of = *fits, rows, prior, away, more, self.which, *self.begun, *since
-        level_kernel.moved(*of, inflation, share, table, first)
+        level_kernel.moved(*of, *true, inflation, share, table, first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -253,6 +253,12 @@ def begun(
     return shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
 
 
+def multivariate_density(way: Array, covariance: Array) -> Array:
+    """(r,) normal densities of (r, 6) about zero, but for a factor that all have."""
+    square = np.einsum("ri,ri->r", way, np.linalg.solve(covariance, way[..., None])[..., 0])
+    return np.asarray(np.exp(-0.5 * square) / np.sqrt(np.linalg.det(covariance)))
+
+
 def moved(
     shift: Array,
     covariance: Array,
@@ -272,6 +278,9 @@ def moved(
     tcp: Array,
     stays_at: Array,
     staying: Array,
+    usual: Array,
+    knock: Array,
+    odds: float,
     inflation: float,
     share: float,
     table: Array,
@@ -280,9 +289,22 @@ def moved(
     way = (shift[rows] - away) @ lever.T - from_shift[which]
     spread = lever @ (covariance[rows] + more) @ lever.T + from_covariance[which]
     errors = [off[rows] @ lever.T - from_off[which]]
+    true_way = way
+    if len(usual):
+        whole = spread + np.einsum("rfi,rfj->rij", errors[0], errors[0])
+        stayed, jumped = (multivariate_density(way - stays_at, whole + usual + more) for more in (0.0, knock))
+        if odds > 0.0:
+            probable = np.maximum(odds, odds * jumped / (odds * jumped + (1.0 - odds) * stayed))
+            prior = np.where(prior > share, prior * probable, prior)
+        else:
+            true_way, unsure, _ = with_known(way, whole, np.zeros((len(way), 0, 6)), stays_at, usual)
+            x, y, z = tcp
+            lever_of_origin = np.hstack([np.eye(3), np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])])
+            each = by_motion @ lever_of_origin
+            spread = spread + np.einsum("kia,rab,kjb->rij", each, unsure, each)
     if len(by_motion):
         # Each by the motion that it has: a file's error does nothing where the mount stayed.
-        ways = origin + way[:, :3] - np.cross(way[:, 3:], tcp)
+        ways = origin + true_way[:, :3] - np.cross(true_way[:, 3:], tcp)
         each = np.moveaxis(by_motion @ ways.T, 2, 0)
         # Such an error is in the motion as published, too, which they are reckoned from.
         at_origin = each[..., :3] - np.cross(each[..., 3:], tcp)
