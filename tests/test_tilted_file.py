@@ -326,6 +326,22 @@ def test_two_short_flat_fingers_are_tilted_square_to_the_way_from_tip_to_tip():
     assert np.arccos(along) == pytest.approx(USUAL_TILT_RAD, abs=0.02) and placed.rotation[1, 2] < sight[1]
 
 
+@pytest.mark.parametrize("root", [0.03, 0.01, -0.03], ids=["closing behind", "nearly parallel", "opening behind"])
+def test_the_tcp_of_flat_fingers_is_between_their_tips(root: float):
+    """Whatever lies innermost farther back: pads, roots, a body; the distance that a user states is the tips'."""
+
+    def finger(name: str, side: float) -> Outline:
+        xy = np.array([(side * (0.05 - root), 0.37), (side * 0.05, 0.05), (side * 0.09, 0.05), (side * 0.14, 0.37)])
+        pieces = ((0, 1), (1, 2), (2, 3))
+        length_px = 900.0 * np.linalg.norm(np.diff(xy, axis=0), axis=1)
+        corner = np.array([False, True, True, False])
+        return Outline(name, xy, corner, pieces, np.array([0.0, -1.0]), length_px, np.zeros((0, 2, 2)), np.zeros(0))
+
+    placed = place([finger("left", -1.0), finger("right", 1.0)])
+    np.testing.assert_allclose(placed.tcp, (0.0, 0.05, 1.0), atol=1e-9)
+    assert [float(points[1, 2]) for points in placed.points] == pytest.approx([1.0, 1.0])
+
+
 def beyond(way: str, odds: float, risk: float, count: int = 1500) -> tuple[float, float, float]:
     """Share of motions that are beyond their bound, of all and of mounts that were knocked (with probability ``odds``),
     and the median bound, m, as a file whose plane is tilted by 15 degrees measures them in a view that shows little;

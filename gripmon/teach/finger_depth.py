@@ -71,8 +71,8 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         direction = None
     if direction is None or sigma > FLAT_SIGMA_RAD:
         return _flat(fingers, centre, rotation, tcp)
-    runs = [_tip_and_sides(finger, direction) for finger in fingers]
-    if any(not tip for tip, _ in runs):
+    runs = [_tip_and_sides(finger, _parallel_to(finger, direction)) for finger in fingers]
+    if not all(sides for _, sides in runs):
         return _flat(fingers, centre, rotation, tcp)
     plane_at = ray if tcp is None else tcp
     turns = [_smooth_turns(finger, tip, sides) for finger, (tip, sides) in zip(fingers, runs, strict=True)]
@@ -96,16 +96,26 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
     return PlacedOutlines(*placed, any(turns), tilt_sigma_rad=sigma)
 
 
-def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tuple[int, int]]]:
-    """Vertices of the tip's outline, and the pieces along the finger that follow it on both sides, outwards first.  The
-    rest, e.g. a body that carries the finger, has another depth.
-    """
-    along = {
+def _parallel_to(finger: Outline, direction: Array) -> set[tuple[int, int]]:
+    """The pieces whose images meet in the vanishing point of a direction (3,)."""
+    return {
         piece
         for piece in finger.pieces
         if missed_rad(direction, 0.5 * finger.xy[list(piece)].sum(axis=0)[None], _unit(finger.xy, piece)[None])[0]
         < 2.0 * PARALLEL_RAD
     }
+
+
+def _more_along(finger: Outline, ahead: Array) -> set[tuple[int, int]]:
+    """The pieces that run more along a direction (2,) of the image than across it."""
+    least = math.sqrt(0.5) * float(np.linalg.norm(ahead))
+    return {piece for piece in finger.pieces if abs(float(_unit(finger.xy, piece) @ ahead)) > least}
+
+
+def _tip_and_sides(finger: Outline, along: set[tuple[int, int]]) -> tuple[set[int], list[tuple[int, int]]]:
+    """Vertices of the tip's outline, and the pieces ``along`` the finger that follow it on both sides, outwards first.
+    The rest, e.g. a body that carries the finger, has another depth.
+    """
     links: dict[int, list[tuple[int, tuple[int, int]]]] = {}
     for a, b in finger.pieces:
         links.setdefault(a, []).append((b, (a, b)))
@@ -126,7 +136,7 @@ def _tip_and_sides(finger: Outline, direction: Array) -> tuple[set[int], list[tu
                 seen.add(piece)
                 tip.add(other)
                 work.append((other, False))
-    return (tip, sides) if sides else (set(), [])
+    return tip, sides
 
 
 def _unit(xy: Array, piece: tuple[int, int]) -> Array:
@@ -219,10 +229,13 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
     ]
     for own in points:
         own[own[:, 2] <= 0.0] = np.nan
-    tips = [int((f.xy @ f.outwards).argmax()) for f in fingers]
     sigma = np.zeros(3)
     if rotation is None or tcp is None:
-        inner = innermost(points) if len(points) > 1 else [points[0][tips[0]]]
+        # Of tapered fingers, and of parallel ones, the innermost vertices of all may be those at their roots.
+        tips = [sorted(_tip_and_sides(f, _more_along(f, aside[:2]))[0]) for f in fingers]
+        foremost = int((fingers[0].xy @ fingers[0].outwards).argmax())
+        ends = [own[tip] for own, tip in zip(points, tips, strict=True)] if len(fingers) > 1 else [points[0][[foremost]]]
+        inner = innermost(ends)
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
         rotation = _axes(inner, direction, normal)
