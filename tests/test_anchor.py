@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting
+from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting, average_of
 from gripmon.monitor.bounds import ModelError
 from gripmon.track.integrity import hypotheses_of
 
@@ -244,3 +244,26 @@ def test_what_the_model_is_wrong_by_does_not_average_out():
     for number, frame in enumerate(right):
         newer.add(frame, ROWS, STILL, 0.1 * number, SURE)
     assert np.abs(newer.of_model).max() < 0.1 * np.abs(frames[0].of_model).max()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 12])
+@pytest.mark.parametrize("common", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("times", [0.3, 3.0])
+def test_an_average_of_images_claims_no_more_than_they_show(frames: int, common: float, times: float):
+    """Of a mount with play, before backgrounds that differ, or one that stands still; its place is that in the images,
+    or that about which they scatter.
+    """
+    rng, play, ratios, places = np.random.default_rng(frames), times * SIGMA, [], []
+    for _ in range(300):
+        truth = rng.normal(size=(frames, 6)) * play
+        seen = stream(rng, frames, common, truth)
+        average = average_of(BASE_T, [(frame, ROWS) for frame in seen], play)
+        for found, true in ((ratios, truth.mean(axis=0)), (places, np.zeros(6))):
+            error = average.shift[0] - true
+            found.append(error @ np.linalg.solve(average.covariance[0], error) / 6.0)
+    assert np.mean(ratios) < 1.1 and np.mean(places) < 1.2
+    claimed = (average.covariance[0].diagonal() - np.square(play) / frames) / seen[0].covariance[0].diagonal()
+    if common == 1.0:  # all of them have one error
+        assert np.mean(claimed) > 0.85
+    elif common == 0.0 and frames == 12 and times < 1.0:
+        assert np.mean(claimed) < 0.85

@@ -216,7 +216,9 @@ def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]],
     covariance = np.einsum("nhij,nhjk,nhlk->hil", weight, own, weight)
     of_model = np.einsum("nhij,nhfj->hfi", weight, np.stack([fits.of_model for fits in each]))
     variance = np.einsum("nhii->nhi", own)
-    scatter = np.minimum(np.square(shift - mean) / (variance + np.square(play)), MOST_SCATTER).sum(axis=0)
+    both = variance + np.square(play)
+    # Of errors that are smaller than the play, a scatter by that says nothing.
+    scatter = (variance / both * np.minimum(np.square(shift - mean) / both, MOST_SCATTER)).sum(axis=0)
     # Of a frame as the average has them: the surer ones weigh more.
     usual = 1.0 / (1.0 / variance).mean(axis=0)
     young = np.clip(np.einsum("hii->hi", covariance) / usual, 1.0 / count, 1.0)
