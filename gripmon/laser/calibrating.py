@@ -35,7 +35,11 @@ contradicts the others.
 MOST_CONTRADICTING = 1.0 / 3.0
 """Largest share of orientations that may contradict the rest: above it there is no telling which are right."""
 SUSPECT_PX = 3.0
-"""Noise of the spots (px) above which other readings of the poses are tried."""
+"""Noise of the spots (px) above which other readings of the poses are tried; where none fits, there is a warning."""
+_LARGE = (
+    "residuals of {:.2g} px are larger than a spot's: an orientation or a pose that was misread, or something moved "
+    "between them"
+)
 LEAST_FITTING = 0.7
 """Minimum inlier ratio of another reading before it is reported."""
 _NOISE_ROUNDS = 8
@@ -99,7 +103,8 @@ def calibrate(
     if lens is not None and not refine_lens:
         problem = SpotProblem(camera, base_T_ee, found.uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise)
         refined = with_held_lens(refined, problem, lens)
-    return replace(found, refined=refined, warnings=contradictions(refined.used, groups))
+    large = (_LARGE.format(refined.scale_px),) if refined.scale_px >= SUSPECT_PX else ()
+    return replace(found, refined=refined, warnings=(*contradictions(refined.used, groups), *large))
 
 
 def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
