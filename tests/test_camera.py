@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
-from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera, same_lens
 from gripmon.model.records import Array
 
 PINHOLE = {"width_px": 768, "height_px": 576, "fx_px": 962.0, "fy_px": 955.0, "cx_px": 380.3, "cy_px": 290.8}
@@ -206,3 +207,18 @@ def test_unusual_but_real_calibrations_are_accepted() -> None:
     assert np.isfinite(make_camera(tele).undistort(grid)).all()
     xy = make_camera(circular_fisheye).undistort(np.array([[640.0, 512.0], [900.0, 512.0], [0.0, 0.0]]))
     assert np.isfinite(xy[:2]).all() and np.isnan(xy[2]).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_lens_is_the_same_with_zeros_behind_and_another_with_another_number(name: str):
+    lens = LENSES[name]
+    changes = [{"fx_px": lens.fx_px + 1e-3}, {"cx_px": lens.cx_px - 1e-3}, {"width_px": lens.width_px + 1}]
+    if not isinstance(lens, PaperLens):
+        padded = msgspec.structs.replace(lens, coefficients=(*lens.coefficients, 0.0))
+        assert same_lens(lens, padded) and same_lens(padded, lens)
+        changes += [{"coefficients": (*lens.coefficients, 1e-4)}]
+    else:
+        changes += [{"kappa_per_px2": lens.kappa_per_px2 + 1e-12}]
+    assert same_lens(lens, msgspec.structs.replace(lens, fy_px=lens.fy_px * (1.0 + 1e-15)))
+    assert not any(same_lens(lens, msgspec.structs.replace(lens, **change)) for change in changes)
+    assert not any(same_lens(lens, other) for other in LENSES.values() if type(other) is not type(lens))

@@ -294,6 +294,26 @@ def test_every_command_takes_the_file_as_it_is(tmp_path: Path, capsys: pytest.Ca
     assert msgspec.to_builtins(camera_in(tmp_path / "four.yaml").lens)["coefficients"] == (-0.03, 0.005, 1e-3, 0.0)
 
 
+def test_a_principal_point_far_from_the_middle_is_doubted(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path, out = tmp_path / "rs.json", tmp_path / "camera.yaml"
+    for change in ({"ppx": 0.0, "ppy": 0.0}, {"width": 480, "height": 848}):
+        path.write_text(json.dumps({**REALSENSE["color"], "coeffs": [0.0] * 5, **change}))
+        with pytest.raises(InputError, match=r"principal point is at \(.*from the middle: .*; gripmon calibrate impor"):
+            camera_in(path)
+        assert main(["calibrate", "import", str(path), "--out", str(out), "--force"]) == 0
+        assert "warning: the principal point is at (" in capsys.readouterr().out
+        assert any("principal point" in warning for warning in read_any_camera(out).warnings)
+
+
+def test_a_file_of_gripmon_s_needs_no_import(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path, own = tmp_path / "rs.json", tmp_path / "camera.yaml"
+    path.write_text(json.dumps(REALSENSE["color"]))
+    assert main(["calibrate", "import", str(path), "--out", str(own)]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", "import", str(own), "--out", str(tmp_path / "again.yaml")]) == 2
+    assert "camera.yaml: is a file of gripmon's" in capsys.readouterr().err
+
+
 def test_a_lens_with_more_coefficients_than_a_fisheye_has_comes_back_as_it_went_out():
     """Of a camera that leans: p2 is above what a fisheye's fourth coefficient is asked for from."""
     message = {**ECHO, "width": 1280, "height": 720, "k": [900.0, 0, 660.0, 0, 900.0, 389.0, 0, 0, 1],

@@ -374,6 +374,17 @@ def test_an_orientation_that_contradicts_the_others_is_named_in_output_and_file(
     assert_near(written, data.truth)
 
 
+def test_residuals_that_no_spot_has_are_doubted(tmp_path, camera, capsys):
+    data, uv = scene(orientations=4)
+    poses = data.base_T_ee.copy()
+    poses[:10, :3, 3] += [0.05, 0.0, 0.0]
+    table = write_csv(tmp_path / "spots.csv", rows_of(replace(data, base_T_ee=poses), uv))
+    assert calibrate(table, "--camera", camera, "--out", tmp_path / "laser.yaml") == 0
+    line = "px are larger than a spot's: an orientation or a pose that was misread"
+    assert line in capsys.readouterr().out
+    assert any(line in warning for warning in yaml.safe_load((tmp_path / "laser.yaml").read_text())["warnings"])
+
+
 def test_files_that_are_none(tmp_path, camera, capsys):
     data, uv = scene()
     table = write_csv(tmp_path / "spots.csv", rows_of(data, uv))

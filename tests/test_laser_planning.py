@@ -10,9 +10,9 @@ from support.laser_scenes import paper_setup, sampled
 from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # noqa: F401 - camera is a fixture
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.planning import candidates, plan
+from gripmon.laser.planning import SEED, candidates, plan
 from gripmon.laser.refinement import SpotProblem, refine
-from gripmon.laser.setup import in_camera, spots_on_plane
+from gripmon.laser.setup import COUNT, in_camera, spots_in_camera, spots_on_plane
 from gripmon.model.geometry import perturbation_between
 
 
@@ -50,6 +50,18 @@ def test_what_is_foretold_is_what_a_calibration_with_these_poses_says():
     again = refine(SpotProblem(data.camera, poses, exact + rng.normal(0.0, refined.scale, exact.shape)), data.truth)
     sigma = np.sqrt(np.trace(again.covariance[:3, :3]))
     assert sigma == pytest.approx(planned.sigmas[-1, 0], rel=0.35)
+
+
+def test_the_first_pose_helps_a_point_at_the_plane_s_distance_most():
+    """Position and rotation of the camera together; by the information of all spots, not step by step."""
+    data, _, refined = calibrated(0)
+    first = plan(refined, 0.8, 1).base_T_ee
+    poses = np.concatenate([first, candidates(refined.setup, data.camera, 0.8, np.random.default_rng(SEED))])
+    spots, slopes = spots_in_camera(refined.setup, poses)
+    rows = (data.camera.project_with_jacobian(spots)[1] @ slopes)[:, :, :COUNT] / refined.scale
+    after = np.linalg.inv(np.linalg.inv(refined.covariance) + rows.transpose(0, 2, 1) @ rows).diagonal(axis1=1, axis2=2)
+    left = after[:, :3].sum(axis=1) + refined.setup.distance_cam_m**2 * after[:, 3:6].sum(axis=1)
+    assert left[0] <= left.min() * (1.0 + 1e-6)
 
 
 def test_planned_poses_help_more_than_random_ones():

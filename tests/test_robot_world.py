@@ -226,20 +226,34 @@ def test_the_command_writes_both_transforms(tmp_path, capsys):
     assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 2
 
 
+def w_first(T):
+    """As rotations that are written with w first come out where it is expected last."""
+    out = T.copy()
+    for pose in out:
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        pose[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    return out
+
+
 MISREAD = {
     "inverted arm": (lambda arm, target: (np.linalg.inv(arm), target), 3, "with the arm's or the target's inverted"),
     "inverted target": (lambda arm, target: (arm, np.linalg.inv(target)), 3, "with the arm's or the target's inverted"),
     "one row later": (lambda arm, target: (arm, np.roll(target, -1, axis=0)), 3, "out of step"),
     "two rows earlier": (lambda arm, target: (arm, np.roll(target, 2, axis=0)), 3, "out of step"),
     "shuffled": (lambda arm, target: (arm, target[::-1]), 3, "contradict each other"),
-    "millimetres": (lambda arm, target: (arm, millimetres(target)), 2, "from the camera (median): millimetres? metres"),
-    "arm in millimetres": (lambda arm, target: (millimetres(arm), target), 2, "millimetres? metres"),
+    "w first": (lambda arm, target: (w_first(arm), w_first(target)), 3, "fit if all quaternions have w first"),
+    "w first in the arm's": (lambda arm, target: (w_first(arm), target), 3, "the arm's quaternions have w first"),
+    "w first in the target's": (lambda arm, target: (arm, w_first(target)), 3, "if the target's quaternions have w"),
+    "the target's size": (lambda arm, target: (arm, longer(target, 2.0)), 3, "fit with targets 0.5 times as far"),
+    "the target's size by 5 %": (lambda arm, target: (arm, longer(target, 1.05)), 3, "with targets 0.953"),
+    "millimetres": (lambda arm, target: (arm, longer(target, 1000.0)), 2, "camera (median): millimetres? metres"),
+    "arm in millimetres": (lambda arm, target: (longer(arm, 1000.0), target), 2, "millimetres? metres"),
 }
 
 
-def millimetres(T):
+def longer(T, times):
     out = T.copy()
-    out[:, :3, 3] *= 1000.0
+    out[:, :3, 3] *= times
     return out
 
 
@@ -253,6 +267,17 @@ def test_poses_that_are_meant_otherwise_are_named_and_nothing_is_written(name, t
     said = capsys.readouterr().err
     assert text in said and said.count("\n") == 1
     assert not (tmp_path / "rw.yaml").exists()
+
+
+def test_an_arm_s_and_a_camera_s_errors_are_calibrated_larger_ones_doubted(tmp_path, capsys):
+    _, _, base_T_ee, cam_T_target = poses(11)
+    for sigma, doubted in ((0.003, False), (0.04, True)):
+        measured = noisy(cam_T_target, np.array([0.5 * sigma] * 3 + [sigma] * 3), 2)
+        table, out = write(tmp_path / "poses.csv", base_T_ee, measured), tmp_path / f"{sigma}.yaml"
+        assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 0
+        told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+        assert len(told) == doubted and len(yaml.safe_load(out.read_text())["warnings"]) == doubted
+        assert all("more than an arm's and a camera's errors" in line for line in told)
 
 
 def test_a_camera_on_the_hand_that_is_taken_for_one_that_stands_is_told(tmp_path, capsys):

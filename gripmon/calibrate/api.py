@@ -276,5 +276,4 @@ def calibrate_robot_world(
     found = robot_world.refine(
         cam_T_target, arm, start, covariance, inexact_arm=True, eye_in_hand=eye_in_hand, common=common
     )
-    robot_world.check_reading(found, cam_T_target, arm)
-    return found
+    return replace(found, warnings=robot_world.check_reading(found, cam_T_target, arm))

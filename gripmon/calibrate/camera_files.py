@@ -20,6 +20,8 @@ LARGEST_TANGENTIAL = 0.01
 """Tangential coefficient above which a lens is more likely a fisheye, whose third and fourth coefficient stand there: a
 lens that is tilted by a whole degree has less.
 """
+FARTHEST_CENTRE = 0.25
+"""Distance of the principal point from the image's middle, over its width or height, beyond which it is doubted."""
 _MOST_NAMED = 6
 _ASKED = "gripmon calibrate import with --model fisheye, or with --model brown_conrady if it is really one"
 
@@ -94,6 +96,10 @@ def _checked(
         make_camera(camera)
     except ValueError as error:
         raise InterchangeError(file, "", f"no camera that can be used: {error}") from None
+    off = [abs(at - 0.5 * (n - 1)) / n for at, n in zip(lens.pinhole[2:], size, strict=True)]
+    if max(off) > FARTHEST_CENTRE:
+        where = f"({camera.cx_px:g}, {camera.cy_px:g}) px of {size[0]} x {size[1]}"
+        warnings += (f"the principal point is at {where}, far from the middle: width and height swapped, or a region?",)
     return camera, warnings
 
 

@@ -116,6 +116,7 @@ class RobotWorldCalibration(
     sigmas: dict[str, float]
     covariance: tuple[float, ...]
     residuals: RobotWorldResiduals
+    warnings: tuple[str, ...] = ()
     provenance: Provenance
 
 
@@ -144,5 +145,6 @@ def robot_world_document(
             used=int(found.used.sum()),
             outliers=tuple(name for name, used in zip(names, found.used, strict=True) if not used),
         ),
+        warnings=found.warnings,
         provenance=provenance,
     )

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.target_shape import MISPRINTED
 from gripmon.model.geometry import invert, make_transform, perturb, skew
 from gripmon.model.least_squares import (
     TUKEY,
@@ -48,10 +49,10 @@ _ARM_STARTS = (1e-5, 2e-4, 3e-3)
 FARTHEST_M = 20.0
 """Largest distance of a target from the camera, and of an arm from its base (m): larger numbers are millimetres."""
 SUSPECT_RAD = 0.02
-"""Residual rotation (rad, each axis) above which other readings of the poses are tried."""
+"""Residuals (rad, each axis; positions as the camera sees them) above which other readings of the poses are tried."""
 LARGEST_RESIDUAL_RAD = 0.1
-"""Residual rotation (rad, each axis) above the errors of any arm and camera."""
-_OTHER_READING_SHARE = 0.1  # another reading must leave less than this part of the residual rotation,
+"""The same above the errors of any arm and camera."""
+_OTHER_READING_SHARE = 0.1  # another reading must leave less than this part of the residuals,
 _OTHER_READING_USED = 0.7  # and use at least this part of the poses
 _OFFSETS = (1, -1, 2, -2)
 """Offsets in rows between poses and what was seen at them that are tried."""
@@ -63,7 +64,7 @@ Unknowns = tuple[Array, Array]
 class RobotWorld:
     """``covariance`` (12, 12) of ``cam_T_base`` and ``ee_T_target``, position then rotation each (axes of cam, of ee);
     ``residuals`` (n, 6), measured against predicted ``cam_T_target``, position (m) and rotation (rad), camera axes;
-    ``used`` (n,).
+    ``used`` (n,).  ``warnings``: doubts, in words.
     """
 
     cam_T_base: Array
@@ -72,6 +73,7 @@ class RobotWorld:
     residuals: Array
     used: NDArray[np.bool_]
     degrees_of_freedom: int
+    warnings: tuple[str, ...] = ()
 
     @property
     def rms_m(self) -> float:
@@ -287,34 +289,82 @@ def check_target_scale(cam_T_target: Array) -> None:
         raise ValueError(f"the target is {far_m:.4g} m from the camera (median): millimetres? metres")
 
 
-def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> None:
-    """:class:`CalibrationError` if large residuals vanish under another reading of the poses (n, 4, 4), or exceed the
-    errors of any arm and camera.
+def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> tuple[str, ...]:
+    """A line where residuals are larger than an arm's and a camera's errors.  :class:`CalibrationError` if they vanish
+    under another reading of the poses (n, 4, 4) or with a target of another size, or exceed the errors of any arm and
+    camera.
     """
-    if found.rms_rad < SUSPECT_RAD:
-        return
-    left_deg = np.degrees(found.rms_rad)
+    _check_size(found, cam_T_target, base_T_ee)
+    off_rad = _off_rad(found, cam_T_target)
+    if off_rad < SUSPECT_RAD:
+        return ()
     for text, target, arm in _readings(cam_T_target, base_T_ee):
-        try:
-            other = refine(target, arm, solve(target, arm))
-        except CalibrationError:
-            continue
-        if other.rms_rad < _OTHER_READING_SHARE * found.rms_rad and other.used.mean() >= _OTHER_READING_USED:
-            raise CalibrationError(f"{text} ({np.degrees(other.rms_rad):.2g} degrees are left, else {left_deg:.2g})")
-    if found.rms_rad > LARGEST_RESIDUAL_RAD:
-        raise CalibrationError(
-            f"the poses of arm and target contradict each other: {left_deg:.2g} degrees are left on average; each "
-            "target's pose with the arm's at that time"
-        )
+        other = _again(target, arm)
+        if other is not None and (left_rad := _off_rad(other, target)) < _OTHER_READING_SHARE * off_rad:
+            left = f"{np.degrees(left_rad):.2g} degrees are left, else {np.degrees(off_rad):.2g}"
+            raise CalibrationError(f"{text} ({left})")
+    left = f"{1e3 * found.rms_m:.2g} mm and {np.degrees(found.rms_rad):.2g} degrees are left on average"
+    right = "each target's pose with the arm's at that time"
+    if off_rad > LARGEST_RESIDUAL_RAD:
+        raise CalibrationError(f"the poses of arm and target contradict each other: {left}; {right}")
+    return (f"{left}, more than an arm's and a camera's errors: {right}",)
+
+
+def _off_rad(found: RobotWorld, cam_T_target: Array) -> float:
+    """Residuals of rotations, and of positions as the camera sees them, each axis."""
+    far_m = float(np.median(np.linalg.norm(cam_T_target[:, :3, 3], axis=1)))
+    return float(np.hypot(found.rms_rad, found.rms_m / max(far_m, 1e-9)))
+
+
+def _again(cam_T_target: Array, base_T_ee: Array) -> RobotWorld | None:
+    """The result of another reading; None if too few poses agree in it."""
+    try:
+        other = refine(cam_T_target, base_T_ee, solve(cam_T_target, base_T_ee))
+    except CalibrationError:
+        return None
+    return other if other.used.mean() >= _OTHER_READING_USED else None
+
+
+def _check_size(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> None:
+    """Reject poses whose positions agree if all targets are farther away or nearer by one factor, which leaves
+    rotations as they are: by linear least squares, then all together.
+    """
+    seen, arm = cam_T_target[found.used], base_T_ee[found.used]
+    shifts = np.broadcast_to(-np.eye(3), (len(seen), 3, 3))
+    rows = np.concatenate([seen[:, :3, 3:], shifts, seen[:, :3, :3]], axis=2).reshape(-1, 7)
+    times = float(np.linalg.lstsq(rows, (arm[:, :3, 3] @ found.cam_T_base[:3, :3].T).ravel(), rcond=None)[0][0])
+    if times <= 0.0 or abs(times - 1.0) < MISPRINTED or len(seen) <= FEWEST_POSES + 1:
+        return
+    scaled = cam_T_target.copy()
+    scaled[:, :3, 3] *= times
+    other = _again(scaled, base_T_ee)
+    if other is not None and other.rms_m < _OTHER_READING_SHARE * found.rms_m:
+        left = f"{1e3 * other.rms_m:.2g} mm are left, else {1e3 * found.rms_m:.2g}"
+        right = "the target in its real size, both in metres, the camera that took the images"
+        raise CalibrationError(f"the poses fit with targets {times:.3g} times as far from the camera ({left}); {right}")
 
 
 def _readings(cam_T_target: Array, base_T_ee: Array) -> Iterator[tuple[str, Array, Array]]:
     # Inverting the arm's poses is equivalent to inverting the target's: the two can't be distinguished.
     text = "the poses fit with the arm's or the target's inverted: base_T_ee and cam_T_target"
     yield f"{text}; or --eye-in-hand is missing, or too much", cam_T_target, np.linalg.inv(base_T_ee)
+    text = "the poses fit if {} quaternions have w first: qx, qy, qz, qw, in this order"
+    yield text.format("all"), w_first(cam_T_target), w_first(base_T_ee)
+    yield text.format("the arm's"), cam_T_target, w_first(base_T_ee)
+    yield text.format("the target's"), w_first(cam_T_target), base_T_ee
     for rows, arm, target in out_of_step(len(base_T_ee)):
         text = f"arm and target are out of step: targets fit the arm's poses {rows}"
         yield text, cam_T_target[target], base_T_ee[arm]
+
+
+def w_first(poses: Array) -> Array:
+    """Poses (n, 4, 4) with rotations as they are if their quaternions were w x y z, but were read as x y z w."""
+    from scipy.spatial.transform import Rotation
+
+    out = poses.copy()
+    turns = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), -1, axis=1)
+    out[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
+    return out
 
 
 def out_of_step(count: int) -> Iterator[tuple[str, slice, slice]]:

@@ -18,7 +18,7 @@ from gripmon.calibrate.bundle import GivenCamera, independent_errors
 from gripmon.calibrate.documents import CalibratedGripper
 from gripmon.calibrate.lens_models import lens_vector
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera, same_lens
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, perturb, perturbation_between, skew
 from gripmon.model.least_squares import whitening
@@ -112,7 +112,7 @@ def compare_hand_eye(
 def _chi2(difference: Array, covariance: Array) -> float:
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     if not (sigma > 0.0).all():
-        raise CalibrationError("the uncertainties are zero; covariances of the errors")
+        raise CalibrationError("the uncertainties are zero or negative; covariances of the errors")
     # In units of the standard deviations: with metres and radians any matrix would look singular.
     try:
         root = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
@@ -203,7 +203,7 @@ def _hand_eyes(
         of = " and ".join(f"{each.name} that of {each.frame or 'the TCP'}" for each in (first, second))
         raise InputError(f"two poses of different frames: {of}; flange_T_tcp in the imported file")
     warnings = []
-    if first.lens is not None and second.lens is not None and first.lens != second.lens:
+    if first.lens is not None and second.lens is not None and not same_lens(first.lens, second.lens):
         warnings.append("made with different camera calibrations, which may explain a difference")
     if first.gripper is not None and second.gripper is not None and first.gripper != second.gripper:
         warnings.append(f"made with different gripper files ({first.gripper.name}, {second.gripper.name})")

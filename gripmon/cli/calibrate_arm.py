@@ -200,4 +200,4 @@ def _robot_world_lines(written: RobotWorldCalibration) -> list[str]:
     for name, transform in list(written.transforms.items())[:2]:
         shown = _shown(transform.translation_m, [f"{name}.{axis}" for axis in "xyz"], sigmas)
         lines.append(f"{name:14s} {shown} mm; {_turned([f'{name}.r{axis}' for axis in 'xyz'], sigmas)}")
-    return lines
+    return [*lines, *(f"warning: {warning}" for warning in written.warnings)]

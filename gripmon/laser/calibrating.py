@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.robot_world import out_of_step
+from gripmon.calibrate.robot_world import out_of_step, w_first
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
 from gripmon.laser.documents import LEAST_NOISE_PX
@@ -36,7 +35,11 @@ contradicts the others.
 MOST_CONTRADICTING = 1.0 / 3.0
 """Largest share of orientations that may contradict the rest: above it there is no telling which are right."""
 SUSPECT_PX = 3.0
-"""Noise of the spots (px) above which other readings of the poses are tried."""
+"""Noise of the spots (px) above which other readings of the poses are tried; where none fits, there is a warning."""
+_LARGE = (
+    "residuals of {:.2g} px are larger than a spot's: an orientation or a pose that was misread, or something moved "
+    "between them"
+)
 LEAST_FITTING = 0.7
 """Minimum inlier ratio of another reading before it is reported."""
 _NOISE_ROUNDS = 8
@@ -100,7 +103,8 @@ def calibrate(
     if lens is not None and not refine_lens:
         problem = SpotProblem(camera, base_T_ee, found.uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise)
         refined = with_held_lens(refined, problem, lens)
-    return replace(found, refined=refined, warnings=contradictions(refined.used, groups))
+    large = (_LARGE.format(refined.scale_px),) if refined.scale_px >= SUSPECT_PX else ()
+    return replace(found, refined=refined, warnings=(*contradictions(refined.used, groups), *large))
 
 
 def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
@@ -248,19 +252,12 @@ def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: Calibra
 def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str, str]]:
     """Other readings: poses, the spots that belong to them, what is wrong if the spots fit, and what would be right."""
     everything = slice(None)
-    turns = base_T_ee[:, :3, :3]
-
-    def turned(rotations: Array) -> Array:
-        out = base_T_ee.copy()
-        out[:, :3, :3] = rotations
-        return out
-
     yield np.linalg.inv(base_T_ee), everything, "the poses are ee_T_base: inverted, the spots fit", "base_T_ee"
-    w_first = Rotation.from_quat(np.roll(Rotation.from_matrix(turns).as_quat(), -1, axis=1)).as_matrix()
     text = "the quaternions have w first: read so, the spots fit"
-    yield turned(w_first), everything, text, "qx, qy, qz, qw, in this order"
-    text = "the rotations are the other way round: inverted, the spots fit"
-    yield turned(turns.transpose(0, 2, 1)), everything, text, "base_R_ee"
+    yield w_first(base_T_ee), everything, text, "qx, qy, qz, qw, in this order"
+    text, turned = "the rotations are the other way round: inverted, the spots fit", base_T_ee.copy()
+    turned[:, :3, :3] = base_T_ee[:, :3, :3].transpose(0, 2, 1)
+    yield turned, everything, text, "base_R_ee"
     for rows, poses, spots in out_of_step(len(base_T_ee)):
         text = f"poses and images are out of step: spots fit the poses {rows}"
         yield base_T_ee[poses], spots, text, "each spot with its own pose"

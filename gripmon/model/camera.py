@@ -70,6 +70,16 @@ class FisheyeLens(
 
 
 LensSettings = PaperLens | BrownConradyLens | FisheyeLens
+_SAME = 1e-9
+
+
+def same_lens(one: LensSettings, other: LensSettings) -> bool:
+    """Whether both are one camera; another program's file may add coefficients of zero, or lose a last digit."""
+    if type(one) is not type(other):
+        return False
+    a, b = (np.concatenate([np.ravel(v) for v in msgspec.structs.astuple(each)]) for each in (one, other))
+    zeros = np.zeros(max(len(a), len(b)))
+    return bool(np.allclose(np.append(a, zeros[len(a) :]), np.append(b, zeros[len(b) :]), rtol=_SAME, atol=0.0))
 
 
 class Camera:

@@ -16,7 +16,7 @@ from gripmon.calibrate.foreign import UnknownFormatError
 from gripmon.daemon.config.robot_file import RobotFile, reference_in
 from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import GivenFile, named_file, read_document, read_settings
-from gripmon.model.camera import LensSettings
+from gripmon.model.camera import LensSettings, same_lens
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.provenance import provenance_of
@@ -104,7 +104,8 @@ def foreign_camera(file: GivenFile) -> CameraCalibration | None:
     except UnknownFormatError:  # the reader of gripmon's own files says what it is
         return None
     if found.warnings:
-        raise InputError(f"{path}: {found.warnings[0]}; gripmon calibrate import with --model brown_conrady or fisheye")
+        right = "gripmon calibrate import, if it is right so; --model brown_conrady or fisheye says the lens"
+        raise InputError(f"{path}: {found.warnings[0]}; {right}")
     return CameraCalibration(
         camera=found.camera, parameters=(), covariance=(), warnings=(f"{found.kind}: its uncertainty is unknown",),
         provenance=provenance_of(f"read from {path.name}, a file of {found.kind}", [file.input]),
@@ -117,7 +118,7 @@ def mismatch(
     """Why a hand/eye calibration, made with a camera and a gripper as far as it tells, doesn't belong to these; None if
     it does.
     """
-    if made_camera not in (None, camera):
+    if made_camera is not None and not same_lens(made_camera, camera):
         return Fault("camera", "isn't the camera that is given", "the hand/eye calibration made with the same camera")
     if made is not None and made.sha256 != gripper_digest(gripper):
         name = made.name
