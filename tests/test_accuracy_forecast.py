@@ -20,7 +20,7 @@ from gripmon.daemon.config import builtin_config
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.accuracy import Accuracy, forecast_frame
+from gripmon.teach.accuracy import Accuracy, forecast_frame, weakest_direction
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import MeasurementSettings
 
@@ -102,6 +102,22 @@ def test_an_exact_opening_leaves_the_pose_of_six_unknowns():
     assert six.jaw is None
     seven = forecast(jaw_sigma_m=0.0, corners=MeasurementSettings())
     np.testing.assert_allclose(seven.expected.array, six.expected.array, rtol=0.05)
+
+
+def test_the_weakest_direction_is_that_of_the_largest_spread():
+    rng, radius_m = np.random.default_rng(3), 0.02
+    mixing = rng.normal(size=(6, 6)) * np.array([1e-6, 2e-6, 1e-5, 1e-4, 3e-4, 5e-4])[:, None]
+    covariance = mixing @ mixing.T
+    weakest = weakest_direction(covariance, radius_m)
+    scale = np.array([1.0] * 3 + [radius_m] * 3)
+    length = np.linalg.norm(weakest * scale)
+    directions = rng.normal(size=(20000, 6))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    scaled = covariance * np.outer(scale, scale)
+    spread = np.sqrt(np.einsum("ni,ij,nj->n", directions, scaled, directions))
+    assert spread.max() <= length
+    own = weakest * scale / length
+    assert np.sqrt(own @ scaled @ own) == pytest.approx(length)
 
 
 def test_corners_nearly_on_a_line_show_it_in_the_covariance():

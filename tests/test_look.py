@@ -224,6 +224,15 @@ def test_poses_outside_the_image_or_behind_the_camera_are_not_seen():
     assert not agreement.seen.any() and not agreement.log_odds.any()
 
 
+def test_colour_and_other_grey_scales_make_no_difference():
+    simulation, look = ordinary()
+    truth, image = simulation.truth(24), simulation.render(24)
+    grey = look.compare(image, truth.cam_T_grip, truth.jaw_opening_m)
+    for other in (np.dstack([image] * 3), image.astype(np.uint16) * 257, image.astype(np.float32) / 255.0):
+        same = look.compare(other, truth.cam_T_grip, truth.jaw_opening_m)
+        assert abs(int(same.agree.sum()) - int(grey.agree.sum())) <= 1
+
+
 def test_a_long_pause_leaves_what_was_learnt():
     simulation = filmed()
     look = taught(simulation)

@@ -110,6 +110,12 @@ def test_they_move_with_the_jaws():
     assert told_m(*seen, -3.3e-3) == pytest.approx(3.3e-3, abs=3e-4)
 
 
+def test_colour_is_read_as_grey():
+    simulation, strips, image = lined()
+    grey = image if image.ndim == 2 else image[..., 0]
+    assert told_m(simulation, strips, np.repeat(grey[..., None], 3, axis=2), 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
+
+
 @pytest.mark.parametrize("way_m", [0.0, *SLIDES_M])
 def test_before_a_background_like_them_fingers_of_one_shade_tell_of_no_slide_that_isnt_there(way_m: float):
     """Their outline may tell the way back, but nothing tells another one."""
