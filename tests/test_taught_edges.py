@@ -10,7 +10,7 @@ from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of,
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
-from gripmon.teach.lines import pool, slopes
+from gripmon.teach.lines import EdgePoints, find_line, pool, slopes
 from gripmon.track.edges.prediction import Prediction, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.settings import SamplingSettings
@@ -173,3 +173,25 @@ def test_the_claimed_covariance_is_that_of_the_errors(own_m: float):
 
 
 # --- one edge's line ---
+
+
+def points_on(lines: list[tuple[float, float, float]], rng: np.random.Generator, profiles: int = 60) -> EdgePoints:
+    """Edge points of one image: a stray in every profile, and lines (offset at both ends, part of the profiles)."""
+    way = np.linspace(0.0, 1.0, profiles)
+    parts = [(way, rng.uniform(-4.5, 4.5, profiles), np.arange(profiles))]
+    for start_px, end_px, share in lines:
+        shown = rng.random(profiles) < share
+        offset_px = start_px + (end_px - start_px) * way + rng.normal(0.0, 0.05, profiles)
+        parts.append((way[shown], offset_px[shown], np.arange(profiles)[shown]))
+    way, offset_px, profile = (np.concatenate(part) for part in zip(*parts, strict=True))
+    none = np.zeros(len(way), dtype=np.intp)
+    return EdgePoints(way, offset_px, np.ones(len(way)), profile, none, np.array([profiles]))
+
+
+def test_of_two_lines_the_expected_one_is_taken_and_the_other_named():
+    points = points_on([(0.3, 0.2, 0.9), (3.2, 3.1, 0.95)], np.random.default_rng(5))
+    near, far = find_line(points, np.zeros(2), 4.0), find_line(points, np.full(2, 3.0), 4.0)
+    assert near is not None and far is not None
+    np.testing.assert_allclose(near.ends_px, [0.3, 0.2], atol=0.08)
+    np.testing.assert_allclose(far.ends_px, [3.2, 3.1], atol=0.08)
+    assert near.rival_px == pytest.approx(2.9, abs=0.5) and far.rival_px == pytest.approx(-2.9, abs=0.5)
