@@ -25,7 +25,7 @@ from gripmon.io.sources import (
     make_simulator,
     open_source,
 )
-from gripmon.io.sources.realtime import SimulatedCamera
+from gripmon.io.sources.realtime import SimulatedCamera, _Schedule
 from gripmon.io.sources.simulated import SimulatedSequence
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
@@ -72,6 +72,31 @@ def frames_of(camera: SimulatedCamera, count: int) -> list[Frame]:
 
 
 # --- which frame comes next ---
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "index", "elapsed_frames", "expected"),
+    [
+        (0, 1, 0, 0.0, 1),
+        (0, 1, 0, 1.9, 1),
+        (0, 1, 0, 2.1, 2),
+        (0, 1, 4, 9.5, 9),
+        (0, 2, 0, 0.5, 2),
+        (0, 2, 0, 2.9, 2),
+        (0, 2, 0, 3.1, 4),
+        (1, 2, 1, 3.9, 3),
+        (1, 2, 1, 8.0, 9),
+        (2, 3, 5, 11.5, 11),
+        (2, 3, 5, 12.0, 14),
+    ],
+)
+def test_frames_whose_time_is_over_are_left_out(
+    first: int, step: int, index: int, elapsed_frames: float, expected: int
+):
+    schedule = _Schedule(64.0, first, step, None)  # a rate without rounding
+    following = schedule.following(index, elapsed_frames / 64.0)
+    assert following == expected
+    assert following % step == first and following > index and following >= int(elapsed_frames)
 
 
 # --- real time ---

@@ -23,7 +23,7 @@ from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, Pa
 from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulate.background import _smear_kernel
 from gripmon.simulate.coverage import CoverageRaster
-from gripmon.simulate.disturbance import srgb_dn
+from gripmon.simulate.disturbance import blur, srgb_dn
 from gripmon.simulate.scenario import (
     Background,
     Creep,
@@ -266,6 +266,17 @@ def test_a_shadow_takes_its_share_of_the_light_and_travels() -> None:
         darkest.append(float(np.flatnonzero(ratio < 0.7).mean()))
     assert darkest[1] - darkest[0] > 150.0 and darkest[2] - darkest[1] > 150.0
     np.testing.assert_array_equal(sim.render(41), simulator(plain_scenario()).render(0))
+
+
+@pytest.mark.parametrize("sigma_px", [0.2, 0.79, 0.8, 3.0])
+def test_blur_has_the_variance_asked_for(sigma_px: float) -> None:
+    point = np.zeros((41, 41), np.float32)
+    point[20, 20] = 1.0
+    spread = blur(point, sigma_px).astype(float)
+    offset = np.arange(41) - 20.0
+    assert spread.sum() == pytest.approx(1.0, abs=1e-5)
+    for axis in (0, 1):
+        assert (spread.sum(axis=axis) * offset**2).sum() == pytest.approx(sigma_px**2, rel=0.02)
 
 
 def edge_variance(image: np.ndarray, row: int, left: int, right: int) -> float:
