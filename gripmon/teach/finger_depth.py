@@ -234,7 +234,8 @@ def _flat(fingers: Sequence[Outline], centre: Array, rotation: Array | None, tcp
         # Of tapered fingers, and of parallel ones, the innermost vertices of all may be those at their roots.
         tips = [sorted(_tip_and_sides(f, _more_along(f, aside[:2]))[0]) for f in fingers]
         foremost = int((fingers[0].xy @ fingers[0].outwards).argmax())
-        ends = [own[tip] for own, tip in zip(points, tips, strict=True)] if len(fingers) > 1 else [points[0][[foremost]]]
+        tips = tips if len(fingers) > 1 else [[foremost]]
+        ends = [own[tip] for own, tip in zip(points, tips, strict=True)]
         inner = innermost(ends)
         tcp = np.mean(inner, axis=0)
         points, tcp = [p / tcp[2] for p in points], tcp / tcp[2]
