@@ -134,7 +134,7 @@ def test_in_place_is_only_said_of_what_is_certain():
     told = mount_of(msgspec.structs.replace(held, reason="hidden"), reference_of(home), *LIMITS)
     assert moves(told) == () and not told.placed  # it is of before somebody moved the camera
     assert summary(told) == "can't tell where the camera stands: hidden"
-    assert summary(mount_of(None, reference_of(home), *LIMITS)).endswith("no frame has come yet")
+    assert summary(mount_of(None, reference_of(home), *LIMITS)).endswith("no frame comes")
 
 
 def test_it_is_put_back_to_where_a_person_had_it_not_to_where_a_knock_left_it():

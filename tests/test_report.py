@@ -101,7 +101,7 @@ def test_a_step_in_a_gap_affects_what_was_done_in_the_gap(dropped: bool):
     (old,) = [each for each in recording.affected if each.what == "old_calibration"]
     assert old.start_ns == START_NS + 200 * PERIOD_NS and old.limit_ns == START_NS + 260 * PERIOD_NS
     assert "Between 22:13:23.9 and 22:13:25.2 it moved, the TCP by 2.00 mm" in recording.summary
-    assert "is affected from 22:13:24.0 " in recording.summary
+    assert "is affected from 22:13:24.0 " in recording.summary and ", by up to 2 mm)" in recording.summary
 
 
 def test_of_frames_seconds_apart_each_counts():

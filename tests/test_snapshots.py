@@ -130,7 +130,7 @@ def test_it_says_how_the_camera_stands_until_the_camera_is_silent(endpoint: str)
 
         def silent() -> bool:
             mount = client.send(CommandName.STATE).mount
-            return mount is not None and mount.reason == "no frame has come yet" and mount.shift_m is None
+            return mount is not None and mount.reason == "no frame comes" and mount.shift_m is None
 
         wait_until(silent, "the camera to be known to be silent")
 

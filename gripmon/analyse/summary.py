@@ -190,10 +190,10 @@ def _times(ranges: Sequence[AffectedRange]) -> str:
     texts = []
     for each in worst:
         end = "the end of the recording" if each.ended_by == "end_of_recording" else clock_time(each.end_ns)
-        texts.append(f"from {clock_time(each.start_ns)} to {end} ({span(each.start_ns, each.end_ns)})")
+        off = f", by up to {millimetres(each.largest.size_m)}" if each.largest else ""
+        texts.append(f"from {clock_time(each.start_ns)} to {end} ({span(each.start_ns, each.end_ns)}{off})")
     more = f" and in {count(len(ranges) - len(worst), 'shorter time')}" if len(ranges) > len(worst) else ""
-    off = max((a.largest.size_m for a in ranges if a.largest), default=0.0)
-    return f"{listed(texts)}{more}, off by up to {millimetres(off)}"
+    return f"{listed(texts)}{more}"
 
 
 def lasting_s(report: RecordingReport, what: str) -> float:

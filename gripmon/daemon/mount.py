@@ -65,7 +65,7 @@ def mount_of(
     """How the camera stands to the reference, as the record shows it."""
     mount = Mount(reference.reference_id, reference.revision, alert_limit_m, alert_limit_rad)
     if record is None:
-        return msgspec.structs.replace(mount, reason="no frame has come yet")
+        return msgspec.structs.replace(mount, reason="no frame comes")
     cam_T_ref = cam_T_reference(record, reference)
     uncertain = record.verdict is not Verdict.VALID
     reason = (record.reason or str(record.state)) if uncertain or cam_T_ref is None else ""
