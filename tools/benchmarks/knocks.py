@@ -68,7 +68,6 @@ class Knock:
     model: Gripper
     simulator: Simulator
     start_cam_T_grip: Array
-    start_covariance: Array
     jaw_sigma_m: float | None
 
     @property
@@ -120,7 +119,6 @@ def draw_knock(seed: int, number: int) -> Knock:
         model=gripper,
         simulator=simulator,
         start_cam_T_grip=drawn.reference(rng, cam_T_grip),
-        start_covariance=np.diag(drawn.REFERENCE_SIGMA**2),
         jaw_sigma_m=sigma_m,
     )
 
