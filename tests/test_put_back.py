@@ -234,7 +234,7 @@ def test_watch_says_what_keeps_it_from_telling(
         return capsys.readouterr().err
 
     replies.append(msgspec.structs.replace(replies[0], mount=mount_of(None, reference_of(UPSIDE_DOWN), *LIMITS)))
-    assert refused() == "watch: arm/wrist: can't tell where the camera stands: no frame has come yet\n"
+    assert refused() == "watch: arm/wrist: can't tell where the camera stands: no frame comes\n"
     replies.append(msgspec.structs.replace(replies[0], mount=None))
     assert "it doesn't say how its camera is mounted" in refused()
     assert refused("--robot", "leg").startswith("watch: no monitor is on the network; ")
