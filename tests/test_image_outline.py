@@ -33,7 +33,7 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     none = np.zeros(len(angle))
     found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
     flat = np.zeros(shape, np.float32)
-    edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
+    edges = Edges(flat, flat, flat > 0, flat)
     matte = Matte(flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})
 
     back = _moved_back(matte, _displaced(stations, found), uv_px[usable]).images
