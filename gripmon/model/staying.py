@@ -207,8 +207,8 @@ def enclosed(edges: Edges) -> Bits | None:
     count = int(labels.max()) + 1
     shown = ~np.isnan(edges.changing)
     shown_px = np.bincount(labels.ravel(), shown.ravel(), minlength=count)
-    total = np.bincount(labels.ravel(), np.where(shown, edges.changing, 0.0).ravel(), minlength=count)
-    changing = np.asarray(total / np.maximum(shown_px, 1), float)
+    crossed = np.bincount(labels.ravel(), np.where(shown, edges.changing, 0.0).ravel(), minlength=count)
+    changing = np.asarray(crossed / np.maximum(shown_px, 1), float)
     most = edges.most_changing
     if most < LEAST_CHANGING:
         return None
