@@ -31,7 +31,7 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     seen[0] = ((uv_px @ matrix[:, :2].T + matrix[:, 2] - uv_px) * normal).sum(axis=1)
     usable = uv_px[:, 0] > 180.0
     none = np.zeros(len(angle))
-    found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
+    found = Transitions(none, none[None], usable, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
     flat = np.zeros(shape, np.float32)
     edges = Edges(flat, flat, flat > 0, flat)
     matte = Matte(flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})

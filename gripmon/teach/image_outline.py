@@ -91,12 +91,13 @@ def see_opening(
     for turn in range(_TURNS):
         along = [_settled(matte, contour, part, near) for part, contour in contours]
         contours = [(own.part, own.stations.uv_px) for own in along]
-        stations, found = _around(matte, along)
-        if found.blur_px > MOST_BLUR_PX:
+        blur_px = float(np.median([own.blur_px for own in along]))
+        if blur_px > MOST_BLUR_PX:
             raise NoResultError(
-                f"the outline is blurred by {found.blur_px:.1f} px in all images; at most {MOST_BLUR_PX:g} px: "
+                f"the outline is blurred by {blur_px:.1f} px in all images; at most {MOST_BLUR_PX:g} px: "
                 "fingertips in focus, no motion during exposure"
             )
+        stations, found = _around(matte, along, blur_px)
         bad = _blurred(found)
         if bad:
             left_out.update({matte.kept[k]: why for k, why in bad.items()})
@@ -112,32 +113,33 @@ def see_opening(
                 break
             matte = _moved_back(matte, moved, stations.uv_px[found.usable])
         step()
-    seen, borders = _fingers(camera, matte, along, parts, found.blur_px, step)
-    return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest, borders)
+    seen, borders = _fingers(camera, matte, along, parts, blur_px, step)
+    return OpeningSeen(matte, seen, left_out, blur_px, parts.rest, borders)
 
 
 @dataclass(frozen=True)
 class _Along:
-    """Stations on the outline of a ``part`` (h, w), and where (s,) it is ``sure`` that they are."""
+    """Stations on the outline of a ``part`` (h, w), and where (s,) it is ``sure`` that they are; its ``blur_px``."""
 
     part: Bits
     stations: Stations
     sure: Bits
+    blur_px: float
 
 
 def _settled(matte: Matte, contour: Array, part: Bits, near: Bits) -> _Along:
     """Stations on the outline beside a contour (k, 2), which doesn't matter any more then."""
     stations = _stations(contour, part, near)
-    off_px, _ = beside_contour(matte.images, stations, matte.noise)
+    off_px, *_ = beside_contour(matte.images, stations, matte.noise)
     stations = _stations(evenly(stations.uv_px + off_px[:, None] * stations.normal, _SMOOTH_PX), part, near)
-    off_px, sure = beside_contour(matte.images, stations, matte.noise)
-    return _Along(part, replace(stations, uv_px=stations.uv_px + off_px[:, None] * stations.normal), sure)
+    off_px, sure, blur_px = beside_contour(matte.images, stations, matte.noise)
+    return _Along(part, replace(stations, uv_px=stations.uv_px + off_px[:, None] * stations.normal), sure, blur_px)
 
 
-def _around(matte: Matte, along: Sequence[_Along]) -> tuple[Stations, Transitions]:
+def _around(matte: Matte, along: Sequence[_Along], blur_px: float) -> tuple[Stations, Transitions]:
     """All stations along the contours, and the transitions measured there."""
     stations = Stations(*(np.concatenate([getattr(s.stations, f.name) for s in along]) for f in fields(Stations)))
-    found = measure_transitions(matte.images, stations, matte.noise, wide=False)
+    found = measure_transitions(matte.images, stations, matte.noise, wide=False, blur_px=blur_px)
     found = replace(found, usable=found.usable & np.concatenate([s.sure for s in along]))
     if np.count_nonzero(found.usable) < SHORTEST_OUTLINE_PX:
         raise NoResultError(

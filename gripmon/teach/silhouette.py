@@ -86,16 +86,15 @@ class Transitions:
     """What the images show across an outline.
 
     ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
-    out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
-    edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
-    each image's transitions over that of all; ``clear`` and
-    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
+    out; ``usable`` (s,); ``shift_px`` (n, s), how much farther out an image shows the edge than all images do, with the
+    relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of each image's transitions over
+    that of all; ``clear`` and ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger,
+    grey.
     """
 
     offset_px: Array
     folds_px: Array
     usable: NDArray[np.bool_]
-    blur_px: float
     shift_px: Array
     worth: Array
     sharpness: Array
@@ -224,27 +223,28 @@ def _across(images: NDArray[np.float32], stations: Stations, noise: float, *, wi
 
 
 def measure_transitions(
-    images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float | None = None
+    images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float
 ) -> Transitions:
-    """The edge's position at each station in ``images`` (n, h, w); ``wide`` searches within 4 px, otherwise within 2 px
-    and more exactly.  ``blur_px`` is estimated if None.
+    """The edge's position at each station in ``images`` (n, h, w), blurred by ``blur_px``; ``wide`` searches within 4
+    px, otherwise within 2 px and more exactly.
     """
     seen = _across(images, stations, noise, wide=wide)
     s, search = seen.s[seen.near], seen.search_px
     transition = seen.transition()
-    if blur_px is None:
-        blur_px = _usual_blur(transition[seen.usable], s, search)
     offset, fits = _edge(transition, s, blur_px, search)
     usable = seen.usable & fits
     fold = folds_of(len(images))
     without = [seen.transition(fold == f) for f in range(int(fold.max()) + 1)]
     folds = _edge(np.concatenate(without), s, blur_px, search)[0].reshape(len(without), -1)
     shift, worth, sharpness = _of_each(seen.d, seen.contrast, seen.s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, seen.clear, seen.different, seen.level)
+    return Transitions(offset, folds, usable, shift, worth, sharpness, seen.clear, seen.different, seen.level)
 
 
-def beside_contour(images: NDArray[np.float32], stations: Stations, noise: float) -> tuple[Array, NDArray[np.bool_]]:
-    """How far (s,) the outline lies beside stations along a closed contour, at most 4 px, and where (s,) that is sure.
+def beside_contour(
+    images: NDArray[np.float32], stations: Stations, noise: float
+) -> tuple[Array, NDArray[np.bool_], float]:
+    """How far (s,) the outline lies beside stations along a closed contour, at most 4 px; where (s,) that is sure; and
+    the usual blur of its transition, px.
 
     Of all ways along the contour at once the most likely, smooth one along which the background begins (dynamic
     programming; Amini, Weymouth and Jain 1990): single stations before texture are off by pixels.  It is sure where any
@@ -261,7 +261,7 @@ def beside_contour(images: NDArray[np.float32], stations: Stations, noise: float
     at = total.argmin(axis=1)
     beside = np.abs(grid - grid[at][:, None]) >= WITHIN_PX
     second = np.where(beside, total, np.inf).min(axis=1) - total.min(axis=1)
-    return grid[at], seen.usable & (second > -math.log(NOT_SURE))
+    return grid[at], seen.usable & (second > -math.log(NOT_SURE)), blur_px
 
 
 def _with_the_rest(cost: Array, grid: Array) -> Array:
