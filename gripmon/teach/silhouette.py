@@ -210,12 +210,13 @@ def _across(images: NDArray[np.float32], stations: Stations, noise: float, *, wi
     d -= (light / usual)[:, :, None] * finger[None]
     sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
-    # What differs between the images is background, what they have in common may be the finger's own shading.
-    shading = 1.0 if wide else _shading(finger[:, s <= -search], d, contrast, s, search)
-    weight = contrast - contrast.mean(axis=0) if wide else contrast
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
-    weight = weight / np.maximum(1.0, np.abs(weight) / 60.0)
-    weight = weight - shading * weight.mean(axis=0)
+    error = np.maximum(1.0, np.abs(contrast) / 60.0)
+    if wide:  # by the images' differences alone: what they have in common may be the finger's own shading
+        weight = (contrast - np.average(contrast, axis=0, weights=1.0 / error)) / error
+    else:
+        weight = contrast / error
+        weight = weight - _shading(finger[:, s <= -search], d, contrast, s, search) * weight.mean(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
