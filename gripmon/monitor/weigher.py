@@ -79,7 +79,7 @@ class Weigher:
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
         self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
-        self._axis = tracker.finger_axis
+        self._axis, self._every = tracker.finger_axis, np.arange(len(self._lasting.name))
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
@@ -260,7 +260,7 @@ class Weigher:
         the reference's frames alone.
         """
         risk, anchor, (first, _) = self._policy.integrity_risk, self.anchor, fits.model.first
-        lasting, every = self._lasting, np.arange(len(self._lasting.name))
+        lasting, every = self._lasting, self._every
         ever, since = list[Cases](), list[tuple[Cases, NDArray[np.intp]]]()
         if anchor is not None and not displaced:
             rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
@@ -319,9 +319,7 @@ class Weigher:
         ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
         axis = cam_T_grip[:3, :3] @ self._axis
-        least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
-        near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
-        return Knocks.of(least_known if near else axis)
+        return Knocks.seen_by(fits.covariance[fits.hypotheses.ends], axis, PARALLEL_COSINE)
 
     @property
     def _usual_motion(self) -> Array:

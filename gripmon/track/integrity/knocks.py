@@ -10,6 +10,7 @@ show has its own share, so that it isn't taken for improbable because it is spec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from gripmon.model.compiled import compiled
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
+from gripmon.model.symmetric import diagonalise
 
 ANY_SHARE = (0.40, 0.45, 0.15)
 ANY_SIGMA_M = (1.3e-3, 2.6e-3, 5.5e-3)
@@ -73,6 +76,13 @@ class Knocks(NamedTuple):
         covariance[kinds:, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
         return _BY_KIND._replace(covariance=covariance)
 
+    @classmethod
+    def seen_by(cls, fit: Array, axis_cam: Array, cosine: float) -> Knocks:
+        """With those along the fingers in the direction that a fit of the covariance (6, 6) knows least, if that is
+        theirs but for an angle of this ``cosine``; else exactly along ``axis_cam`` (3,).
+        """
+        return cls.of(axis_cam) if not axis_cam.any() else cls.of(least_known(fit, axis_cam, cosine))
+
     @property
     def spread(self) -> Array:
         """(6, 6) covariance of the motion by any knock."""
@@ -87,6 +97,23 @@ _BY_KIND = Knocks(
     ),
     np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
 )
+
+
+@compiled
+def least_known(covariance: Array, axis: Array, cosine: float) -> Array:
+    """(3,) the direction in which a ``covariance`` (6, 6) has the position's largest variance, if its angle to the
+    ``axis`` (3,) has more than this ``cosine``; else the axis.
+    """
+    matrix, vectors, most = covariance[:3, :3].copy(), np.empty((3, 3)), 0
+    diagonalise(matrix, vectors)
+    for k in range(1, 3):
+        if matrix[k, k] > matrix[most, most]:
+            most = k
+    along, length = 0.0, 0.0
+    for k in range(3):
+        along += vectors[k, most] * axis[k]
+        length += axis[k] * axis[k]
+    return vectors[:, most].copy() if abs(along) > cosine * math.sqrt(length) else axis
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:

@@ -326,7 +326,7 @@ def warm_up() -> None:
         _, at, fits, _, _ = refitted(*made, 1.0)
     averages, _ = follow(fits, fits, none)
     before = at, np.eye(6), fits.of_model[0]
-    knocks = Knocks.of(none[:3])
+    knocks = Knocks.seen_by(np.eye(6), np.ones(3), 0.0)
     found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
     after_knocks(fits, before, knocks, found, 0.0)
     told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))
