@@ -32,7 +32,7 @@ from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
-from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
+from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY, least_known
 from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
@@ -273,7 +273,9 @@ class Weigher:
         for _, found in wrong:
             left_out, count = left_out + found.left_out, count + len(found.prior)
         # Of what isn't probable enough to have a bound, whichever, the prior counts alone.
-        now = [stayed, *(of.after(stayed.away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
+        now, share = [stayed], (risk - left_out) / count
+        for of, found in wrong:
+            now.append(of.after(stayed.away, knocks, found, share))
         of_motion = self._of_motion(now, since, fits, cam_T_grip, knocks, displaced)
         absolutely = fits.model.absolute([*now, *ever], cam_T_grip)
         return Bounds(protection_of(absolutely, risk, left_out), protection_of(of_motion, risk, left_out))
@@ -319,7 +321,7 @@ class Weigher:
         ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
         axis = cam_T_grip[:3, :3] @ self._axis
-        return Knocks.seen_by(fits.covariance[fits.hypotheses.ends], axis, PARALLEL_COSINE)
+        return Knocks.of(least_known(fits.covariance[fits.hypotheses.ends], axis, PARALLEL_COSINE))
 
     @property
     def _usual_motion(self) -> Array:

@@ -76,13 +76,6 @@ class Knocks(NamedTuple):
         covariance[kinds:, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
         return _BY_KIND._replace(covariance=covariance)
 
-    @classmethod
-    def seen_by(cls, fit: Array, axis_cam: Array, cosine: float) -> Knocks:
-        """With those along the fingers in the direction that a fit of the covariance (6, 6) knows least, if that is
-        theirs but for an angle of this ``cosine``; else exactly along ``axis_cam`` (3,).
-        """
-        return cls.of(axis_cam) if not axis_cam.any() else cls.of(least_known(fit, axis_cam, cosine))
-
     @property
     def spread(self) -> Array:
         """(6, 6) covariance of the motion by any knock."""
@@ -101,7 +94,7 @@ _BY_KIND = Knocks(
 
 @compiled
 def least_known(covariance: Array, axis: Array, cosine: float) -> Array:
-    """(3,) the direction in which a ``covariance`` (6, 6) has the position's largest variance, if its angle to the
+    """(3,) the direction in which a fit with the ``covariance`` (6, 6) knows a position least, if its angle to the
     ``axis`` (3,) has more than this ``cosine``; else the axis.
     """
     matrix, vectors, most = covariance[:3, :3].copy(), np.empty((3, 3)), 0
