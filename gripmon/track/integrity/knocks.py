@@ -69,7 +69,7 @@ class Knocks(NamedTuple):
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        length, kinds = float(np.linalg.norm(axis_cam)), len(ANY_SHARE)
+        length, kinds = math.sqrt(float(axis_cam @ axis_cam)), len(ANY_SHARE)
         if length == 0.0:
             return cls(np.array(ANY_SHARE), _BY_KIND.covariance[:kinds], _BY_KIND.along[:kinds])
         covariance, way = _BY_KIND.covariance.copy(), axis_cam / length

@@ -199,7 +199,7 @@ class FingerStrips:
         independent = self._independent
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
-        farther, farthest = self._farther, self._farthest
+        farthest = self._farthest
         alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - farthest**2
         most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
         if alone:
@@ -211,7 +211,7 @@ class FingerStrips:
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = float(unexplained.min())
         # What looks alike farther on is always seen there, and alone where the place itself is hidden.
-        unexplained[beyond_chance * unexplained >= _unexplained(farther, most_alike)] = 1.0
+        unexplained[beyond_chance * unexplained >= self._farther_left[most_alike]] = 1.0
         slide_px = int(np.argmin(unexplained)) - REACH_PX
         if here > beyond_chance * float(unexplained.min()):
             if independent < FEWEST_POINTS:
@@ -227,12 +227,12 @@ class FingerStrips:
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
         """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
-        there = np.clip(strips, -self._most, self._most) * layout.within
+        there = _clipped(strips, self._most) * layout.within
         return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
 
     def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
         """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
-        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -self._most, self._most)
+        strips = _clipped(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), self._most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
@@ -240,15 +240,16 @@ class FingerStrips:
 
     def _know_farther(self) -> None:
         """What a comparison needs of the usual correlations."""
-        self._farther = _farther_on(self._usual)
-        self._farthest = float(self._farther.max())
+        farther = _farther_on(self._usual)
+        self._farthest = float(farther.max())
+        self._farther_left = {most: _unexplained(farther, most) for most in (EXPLAINED_CORRELATION, 1.0)}
 
     def _prepare(self, layout: _Layout) -> None:
         """What a comparison needs of the mean."""
         # Strips side by side show the same.
         self._independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
-        self._learnt = np.clip(self._mean, -self._most, self._most)
+        self._learnt = _clipped(self._mean, self._most)
         self._own = float(np.square(self._learnt).sum())
         self.ready = self._own > 0.0
 
@@ -414,9 +415,14 @@ def _farther_on(alike: Array) -> Array:
     return out
 
 
-def _unexplained(alike: Any, most_alike: float) -> Any:
+def _unexplained(alike: Array, most_alike: float) -> Array:
     """Part of the variance that correlations leave, none being better than ``most_alike``."""
-    return 1.0 - np.square(np.clip(alike, 0.0, most_alike))
+    return np.asarray(1.0 - np.square(np.minimum(np.maximum(alike, 0.0), most_alike)))
+
+
+def _clipped(values: NDArray[np.float32], most: float) -> NDArray[np.float32]:
+    """The values, none larger than ``most``, whichever its sign; ``np.clip`` takes three times as long to begin."""
+    return np.asarray(np.minimum(np.maximum(values, -most), most))
 
 
 @lru_cache(maxsize=4)
