@@ -227,12 +227,12 @@ class FingerStrips:
 
     def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
         """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
-        there = _clipped(strips, self._most) * layout.within
+        there = np.clip(strips, -self._most, self._most) * layout.within
         return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
 
     def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
         """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
-        strips = _clipped(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), self._most)
+        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -self._most, self._most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
@@ -249,7 +249,7 @@ class FingerStrips:
         # Strips side by side show the same.
         self._independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
-        self._learnt = _clipped(self._mean, self._most)
+        self._learnt = np.clip(self._mean, -self._most, self._most)
         self._own = float(np.square(self._learnt).sum())
         self.ready = self._own > 0.0
 
@@ -417,12 +417,7 @@ def _farther_on(alike: Array) -> Array:
 
 def _unexplained(alike: Array, most_alike: float) -> Array:
     """Part of the variance that correlations leave, none being better than ``most_alike``."""
-    return np.asarray(1.0 - np.square(np.minimum(np.maximum(alike, 0.0), most_alike)))
-
-
-def _clipped(values: NDArray[np.float32], most: float) -> NDArray[np.float32]:
-    """The values, none larger than ``most``, whichever its sign; ``np.clip`` takes three times as long to begin."""
-    return np.asarray(np.minimum(np.maximum(values, -most), most))
+    return np.asarray(1.0 - np.square(np.clip(alike, 0.0, most_alike)))
 
 
 @lru_cache(maxsize=4)
