@@ -26,6 +26,7 @@ from gripmon.daemon.recorded_run import one_recording
 from gripmon.daemon.replaying import replay
 from gripmon.daemon.running import run
 from gripmon.io.sources.files import FolderSettings, FolderSource
+from gripmon.model.outputs import Output
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -37,6 +38,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.record.recorder import Recorder
 from gripmon.record.write import open_recorder
 
 WARNED = Alert(
@@ -123,6 +125,13 @@ class Camera(Given):
     live = True
 
 
+class PassedOn(Output):
+    """Into a recorder that the loop doesn't close: it gives a slow disk ten seconds."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.frame, self.event = recorder.frame, recorder.event  # type: ignore[method-assign]
+
+
 def test_what_a_live_run_searched_beside_its_frames_counts_in_the_same_frames_again(sequence: Path, tmp_path: Path):
     """Frames come at once, and a search ends whenever it does."""
     config = load_config(sequence_config(sequence), check_source=False)
@@ -132,8 +141,8 @@ def test_what_a_live_run_searched_beside_its_frames_counts_in_the_same_frames_ag
     frames = [dataclasses.replace(f, image=np.roll(noise, f.seq) if 8 <= f.seq < 20 else f.image) for f in frames]
     with one_recording(tmp_path / "live.rrd", config) as recorder:
         run(
-            Monitor(config), source=Camera(frames), outputs=(), recorder=recorder, estimates=tmp_path / "then.jsonl",
-            settings=config.settings.daemon, robot="demo", camera="wrist",
+            Monitor(config), source=Camera(frames), outputs=(PassedOn(recorder),), recorder=Recorder(),
+            estimates=tmp_path / "then.jsonl", settings=config.settings.daemon, robot="demo", camera="wrist",
         )  # fmt: skip
     then = without_latency(tmp_path / "then.jsonl")
     assert replayed(tmp_path / "live.rrd", tmp_path / "again.jsonl") == then
