@@ -12,9 +12,9 @@ from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import FPS, frames_of, new_monitor, rendered, replaced
 
 from gripmon.model.camera import make_camera
-from gripmon.model.records import Cause, CauseWeight, Explanation, Frame, Origin, to_json
+from gripmon.model.records import Beside, Cause, CauseWeight, Explanation, Frame, Origin, to_json
 from gripmon.monitor import Tracker
-from gripmon.monitor.analysis import CONCLUDED_EVERY, CONFIRMED_AFTER_S, CauseAnalysis
+from gripmon.monitor.analysis import CONCLUDED_AT, CONCLUDED_EVERY, CONFIRMED_AFTER_S, CauseAnalysis
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario
@@ -135,6 +135,46 @@ def test_a_thread_beside_the_frames_changes_no_record(scene: str):
         stop.set()
         worker.join()
     assert sum(busy) >= 2, "the thread had something to do"
+
+
+@pytest.mark.parametrize("scene", ["bump", "bent_finger"])
+def test_no_live_frame_works_beside_itself_and_a_replay_repeats_what_counted_when(
+    scene: str, monkeypatch: pytest.MonkeyPatch
+):
+    """On a machine so busy that what goes on beside the frames is done only after every ninth, and often too late."""
+    live, again, live_works, do_next = new_monitor(), new_monitor(), [], Backlog._do_next
+    live.run_live()
+
+    def noted(backlog: Backlog[object], *wanted: object) -> None:
+        live_works.append(backlog)
+        do_next(backlog, *wanted)
+
+    begun, used, analysed = [], [], 0
+    for number, frame in enumerate(frames_of(scene)[0]):
+        with monkeypatch.context() as patched:
+            patched.setattr(Backlog, "_do_next", noted)
+            found = live.process(frame)
+        assert not live_works
+        then = live.beside
+        assert then is not None
+        assert to_json(again.process(frame, then)) == to_json(found) and again.beside == then
+        begun += [frame.seq] * then.searches
+        used += [] if then.searched_seq is None else [(then.searched_seq, frame.seq)]
+        analysed += then.analysed
+        if number % 9 == 8:
+            live.run_pending()
+    assert [of for of, _ in used] == begun[: len(used)] and all(of < seq for of, seq in used)
+    assert used if scene == "bump" else analysed > CONCLUDED_AT[0]
+
+
+def test_a_replay_of_other_images_keeps_to_the_clock_where_the_recorded_frame_began_no_search():
+    frames, _ = frames_of("static")
+    noise = np.random.default_rng(1).integers(0, 256, frames[0].image.shape, dtype=np.uint8)
+    monitor, begun = new_monitor(), []
+    for number, frame in enumerate(frames[:30]):
+        monitor.process(frame if number < 5 else replaced(frame, image=noise), Beside())
+        begun += [number] * monitor._tracker.searching.searches
+    assert begun[0] == 5 and len(begun) >= 2
 
 
 def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monkeypatch: pytest.MonkeyPatch):

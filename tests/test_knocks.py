@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from gripmon.track.integrity import Knocks
-from gripmon.track.integrity.knocks import ANY_SHARE, ANY_SIGMA_M, log_likely
+from gripmon.track.integrity.knocks import ANY_SHARE, ANY_SIGMA_M, least_known, log_likely
 
 AXIS_CAM = np.array([0.0, 0.6, 0.8])
 
@@ -29,6 +29,20 @@ def test_one_in_three_goes_along_the_fingers():
     shift_m = sampled_m(Knocks.of(AXIS_CAM))
     across_m = np.linalg.norm(shift_m - np.outer(shift_m @ AXIS_CAM, AXIS_CAM), axis=1)
     assert np.mean(across_m < 1e-9) == pytest.approx(1.0 / 3.0, abs=0.02)
+
+
+def test_the_direction_that_a_fit_knows_least_is_numpys_unless_it_points_elsewhere():
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        root = rng.normal(size=(6, 6)) * 10.0 ** rng.uniform(-6.0, -2.0, size=(6, 1))
+        covariance, axis = root @ root.T, rng.normal(size=3)
+        largest = np.linalg.eigh(covariance[:3, :3])[1][:, 2]
+        found = least_known(covariance, axis, 0.0)
+        np.testing.assert_allclose(np.outer(found, found), np.outer(largest, largest), atol=1e-12)
+        cosine = abs(largest @ axis) / np.linalg.norm(axis)
+        assert least_known(covariance, axis, 1.001 * cosine) is axis
+        assert least_known(covariance, axis, 0.999 * cosine) is not axis
+    assert not least_known(np.eye(6), np.zeros(3), 0.9).any(), "fingers without a direction"
 
 
 def test_how_likely_a_shift_is_follows_the_density_of_what_is_sampled():

@@ -20,7 +20,7 @@ from support.loopback import frame_record
 
 from gripmon.cli import main
 from gripmon.daemon.replaying import Counts
-from gripmon.model.records import Frame, FrameRecord, Origin, Refusal
+from gripmon.model.records import Beside, Frame, FrameRecord, Origin, Refusal
 from gripmon.monitor import Monitor
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -246,10 +246,10 @@ def test_a_monitor_that_fails_on_a_frame_costs_that_frame_only(
 ):
     process = Monitor.process
 
-    def failing(self: Monitor, frame: Frame) -> FrameRecord:
+    def failing(self: Monitor, frame: Frame, then: Beside | None) -> FrameRecord:
         if frame.seq in (4, 9):
             raise ValueError(f"singular {frame.seq}")
-        return process(self, frame)
+        return process(self, frame, then)
 
     monkeypatch.setattr(Monitor, "process", failing)
     lines = replayed(sequence, tmp_path / "out.jsonl")

@@ -19,11 +19,14 @@ from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.analyse.comparison import Differences
 from gripmon.cli import main
+from gripmon.daemon.api import Monitor
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.recorded_run import one_recording
 from gripmon.daemon.replaying import replay
+from gripmon.daemon.running import run
 from gripmon.io.sources.files import FolderSettings, FolderSource
+from gripmon.model.outputs import Output
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -35,6 +38,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.record.recorder import Recorder
 from gripmon.record.write import open_recorder
 
 WARNED = Alert(
@@ -113,6 +117,37 @@ def test_refused_and_odd_frames_are_given_again(sequence: Path, tmp_path: Path, 
     assert again == without_latency(tmp_path / "then.jsonl")
     said = capsys.readouterr().err
     assert "5 refused frames have no image in the recording" in said and "every number the same" in said
+
+
+class Camera(Given):
+    """Of a live camera, none of whose frames waits."""
+
+    live = True
+
+
+class PassedOn(Output):
+    """Into a recorder that the loop doesn't close: it gives a slow disk ten seconds."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.frame, self.event = recorder.frame, recorder.event  # type: ignore[method-assign]
+
+
+def test_what_a_live_run_searched_beside_its_frames_counts_in_the_same_frames_again(sequence: Path, tmp_path: Path):
+    """Frames come at once, and a search ends whenever it does."""
+    config = load_config(sequence_config(sequence), check_source=False)
+    noise = np.random.default_rng(3).integers(0, 256, (config.camera.height_px, config.camera.width_px), np.uint8)
+    folder = FolderSource(FolderSettings(path="."), sequence)
+    frames = [frame for frame in iter(folder.read, None) if isinstance(frame, Frame)]
+    frames = [dataclasses.replace(f, image=np.roll(noise, f.seq) if 8 <= f.seq < 20 else f.image) for f in frames]
+    with one_recording(tmp_path / "live.rrd", config) as recorder:
+        run(
+            Monitor(config), source=Camera(frames), outputs=(PassedOn(recorder),), recorder=Recorder(),
+            estimates=tmp_path / "then.jsonl", settings=config.settings.daemon, robot="demo", camera="wrist",
+        )  # fmt: skip
+    then = without_latency(tmp_path / "then.jsonl")
+    assert replayed(tmp_path / "live.rrd", tmp_path / "again.jsonl") == then
+    beside = [json.loads(line)["beside"] for line in then]
+    assert next(seq for seq, each in enumerate(beside) if each["searches"]) == 8
 
 
 def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

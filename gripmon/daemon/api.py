@@ -27,7 +27,7 @@ from gripmon.io.sources import open_source as start
 from gripmon.io.wire import Keys, Link
 from gripmon.judge.references import Keep
 from gripmon.model.errors import NoResultError
-from gripmon.model.records import Frame, FrameRecord, Image, MonitorState
+from gripmon.model.records import Beside, Frame, FrameRecord, Image, MonitorState
 from gripmon.model.response import likely_linear
 
 
@@ -50,11 +50,11 @@ class Monitor(monitor.Monitor):
         self._has_jaw = config.gripper.has_jaw
         self._fixed = config.settings.jaw.source == "fixed"
 
-    def process(self, frame: Frame) -> FrameRecord:
+    def process(self, frame: Frame, then: Beside | None = None) -> FrameRecord:
         """One frame in, one record out; with ``jaw.source: fixed`` at the configuration's jaw opening.  A bad frame
-        never raises, but gives a record with a reason.
+        never raises, but gives a record with a reason.  ``then``: ``beside`` of its record, to replay a live run.
         """
-        return super().process(self.with_opening(frame))
+        return super().process(self.with_opening(frame), then)
 
     def with_opening(self, frame: Frame) -> Frame:
         """The frame with the jaw opening that the monitor uses."""

@@ -60,6 +60,8 @@ class Daemon(Telling):
     def __init__(self, monitor: Monitor, parts: Parts, snapshots: Snapshots | None = None) -> None:
         super().__init__(monitor, parts)
         self._monitor = monitor
+        if parts.source.live:
+            monitor.run_live()
         self._odd_about: Callable[[Image], str | None] | None = parts.odd_about
         self._jaw, self._keeper = parts.jaw, parts.keeper
         self._snapshots = snapshots or Snapshots(parts.outlines)
@@ -180,7 +182,8 @@ class Daemon(Telling):
                 _log.warning("%s", odd)
             self._odd_about = None
         frame, record, failure = self._judge(frame)
-        record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
+        took_ns = time.monotonic_ns() - arrived_ns
+        record = msgspec.structs.replace(record, latency_ns=took_ns, beside=self._monitor.beside)
         several = self._not_alone()
         told = withheld(record, several) if several else record
         trace, notes = self._monitor.trace, self._monitor.notes

@@ -46,7 +46,7 @@ from gripmon.model.records import (
     unmeasured_record,
 )
 from gripmon.monitor import warm_up
-from gripmon.record.read import recordings_below
+from gripmon.record.read import RecordedFrames, recordings_below
 from gripmon.record.recorder import Recorder
 
 _log = logging.getLogger(__name__)
@@ -76,8 +76,9 @@ def replay(
     records, except for ``latency_ns``.
 
     ``source``: a folder of images or a video file, or the result of :func:`gripmon.open_source`, which the caller
-    closes.  ``recorder`` records the replay; ``past``: initial state and commands; ``warn`` is called with a line of
-    text if something other than a frame is wrong.
+    closes.  Searches and the cause analysis beside recorded frames count from the frames on that they counted from.
+    ``recorder`` records the replay; ``past``: initial state and commands; ``warn`` is called with a line of text if
+    something other than a frame is wrong.
 
     Raises :class:`SourceError` for a source that can't be read.  An unusable frame gives a record with a reason.
     """
@@ -98,12 +99,14 @@ def replay(
             ignored = True
             warn("the frames have jaw openings, but jaw.source is fixed: they are not used")
         frame = monitor.with_opening(frame)
+        then = source.record if isinstance(source, RecordedFrames) else None
         start_ns = time.perf_counter_ns()
         try:
-            record = monitor.process(frame)
+            record = monitor.process(frame, None if then is None else then.beside)
         except Exception as error:  # noqa: BLE001  reported in the record and in the summary
             record = unmeasured_record(frame, monitor.reference, f"internal error: {in_short(error)}")
-        record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
+        took_ns = time.perf_counter_ns() - start_ns
+        record = msgspec.structs.replace(record, latency_ns=took_ns, beside=monitor.beside)
         if monitor.reference.revision != revision:
             revision = monitor.reference.revision
             recorder.event(monitor.reference)

@@ -22,9 +22,9 @@ from gripmon.model.errors import in_short
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import Array, Cause, Drift, EdgeEvidence, Explanation, Frame, ReferenceRecord
+from gripmon.model.records import Array, Beside, Cause, Drift, EdgeEvidence, Explanation, Frame, ReferenceRecord
 from gripmon.monitor.answers import gripper_astray
-from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
+from gripmon.monitor.backlog import MOST_WAITING, RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.standing import Standing
 from gripmon.monitor.tracker import Tracker
@@ -67,6 +67,11 @@ class CauseAnalysis:
         self._asked, self._calm = 0, CALM_FRAMES
         self._explanation = Explanation()
         self._wants_baseline = judge.wants_baseline
+        self.live = False
+        """No frame waits for a result: it counts once it is there."""
+        self.analysed = 0
+        """Results that count from the newest frame on."""
+        self._waits = True
 
     def run_pending(self) -> None:
         """Run the waiting tasks; in any thread."""
@@ -124,7 +129,8 @@ class CauseAnalysis:
         else:
             if self._calm == CALM_FRAMES:
                 self._forget()
-            gathers, concludes = usual and self._calm >= CALM_FRAMES and self._wants_baseline, False
+            room = self._waits or len(self._backlog) < MOST_WAITING // 4
+            gathers, concludes = usual and self._calm >= CALM_FRAMES and self._wants_baseline and room, False
         if not gathers:
             return known
         assert frame.image is not None
@@ -145,9 +151,15 @@ class CauseAnalysis:
         """
         return self._explanation if self._asked >= CONCLUDED_AT[0] and self._calm <= LULL_FRAMES else Explanation()
 
-    def catch_up(self, now_s: float) -> None:
-        """Use the results that are due.  A failed task costs an explanation, not a frame."""
-        for found in self._backlog.results(now_s):
+    def catch_up(self, now_s: float, then: int | None = None) -> None:
+        """Use the results that are due, or so many as ``then``.  A failed task costs an explanation, not a frame."""
+        backlog = self._backlog
+        if then is None:
+            results = list(backlog.results(now_s, waits=not self.live))
+        else:  # a replay of other images may have begun more of them
+            results = [backlog.next() for _ in range(max(min(then, len(backlog)), len(backlog) - MOST_WAITING))]
+        self.analysed, self._waits = len(results), then is None and not self.live
+        for found in results:
             if isinstance(found, Exception):
                 self._explanation = Explanation(text=f"cause analysis failed: {in_short(found)}")
                 continue
@@ -209,9 +221,11 @@ class FrameAnalysis:
             # How edges look from where the camera is now; an undo doesn't move it.
             self._watches = Watches(len(self._gripper.finger_ids))
 
-    def begin_frame(self, frame: Frame, now_s: float) -> tuple[StreamFault, ...]:
-        """Return the stream's faults; pass its rate to the drift test, and use the cause analyses that are due."""
-        self.causes.catch_up(now_s)
+    def begin_frame(self, frame: Frame, now_s: float, then: Beside | None = None) -> tuple[StreamFault, ...]:
+        """Return the stream's faults; pass its rate to the drift test, and use the cause analyses that are due, or that
+        counted from the frame on of which this is a replay, ``then``.
+        """
+        self.causes.catch_up(now_s, None if then is None else then.analysed)
         faults = self.stream.add(frame)
         if (repeated := self._repeats.taken()) is not None:
             faults = (*faults, repeated)  # known from the frame before: it takes a measurement

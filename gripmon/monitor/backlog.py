@@ -1,7 +1,7 @@
 """Work that takes longer than a frame, done in the background: cause analysis, and the search for a lost gripper.
 
-No frame waits for it, and yet a replay decides as the daemon did: a result counts from a fixed moment of the frames'
-own clock on, in whichever thread it was computed.
+A replay decides as the daemon did: a result counts from a fixed moment of the frames' own clock on, in whichever thread
+it was computed, or from the frame on that its taker has recorded.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ RESULT_AFTER_S = 0.1
 """From the frame that starts a task to the one in which its result counts: a search and an analysis take 20 to 50 ms
 (tools/bench latency); a controller notices tenths of a second.
 """
+
+MOST_WAITING = 32
+"""Tasks of a live camera whose results aren't there yet, a frame's image each, some 15 MB: beyond that frames wait."""
 
 _T = TypeVar("_T")
 
@@ -56,16 +59,23 @@ class Backlog(Generic[_T]):
         self._tasks.append(task)
         self._undone.append(task)
 
-    def results(self, now_s: float) -> Iterator[_T | Exception]:
-        """The results that are due, in the order of their tasks, computed now if need be; of a failed task its
+    def results(self, now_s: float, *, waits: bool = True) -> Iterator[_T | Exception]:
+        """The results that are due, in the order of their tasks, computed now if need be, unless nobody ``waits``: then
+        those that are there, and more only so that no more than :data:`MOST_WAITING` are left; of a failed task its
         exception.
         """
         while self._tasks and self._tasks[0].due_s <= now_s:
-            task = self._tasks.popleft()
-            while not task.done:
-                self._do_next(task)
-            assert task.result is not None
-            yield task.result
+            if not (waits or self._tasks[0].done or len(self._tasks) > MOST_WAITING):
+                break
+            yield self.next()
+
+    def next(self) -> _T | Exception:
+        """The next result, due or not, as of :meth:`results`."""
+        task = self._tasks.popleft()
+        while not task.done:
+            self._do_next(task)
+        assert task.result is not None
+        return task.result
 
     def run(self) -> None:
         """Run all waiting tasks, one after the other."""

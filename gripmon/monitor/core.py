@@ -25,6 +25,7 @@ from gripmon.model.poses import to_record
 from gripmon.model.records import (
     Alert,
     Array,
+    Beside,
     Command,
     CommandName,
     CommandReply,
@@ -104,6 +105,7 @@ class Monitor:
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
         self._jumped = False  # since the last frame that was believed
+        self._live = self._repeats = False  # frames wait for nothing; the newest one repeats a recorded one
         self._restarted = state is not None  # and not yet known whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state, keep)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
@@ -177,18 +179,35 @@ class Monitor:
             at_reference=self._trust.since.state() or msgspec.UNSET,
         )
 
-    def process(self, frame: Frame) -> FrameRecord:
+    def run_live(self) -> None:
+        """From now on no frame waits for what :meth:`run_pending` does: it counts from the frame on that follows its
+        end, which :attr:`beside` tells.
+        """
+        self._live = True
+        self._tracker.searching.live = self._analysis.causes.live = True
+
+    @property
+    def beside(self) -> Beside | None:
+        """What the newest frame had to do with :meth:`run_pending`, to be recorded with it; None where it waits."""
+        if not (self._live or self._repeats):
+            return None
+        searching = self._tracker.searching
+        search = (False, None) if self._newest is None else (searching.searches, searching.searched_seq)
+        return Beside(*search, self._analysis.causes.analysed)
+
+    def process(self, frame: Frame, then: Beside | None = None) -> FrameRecord:
         """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason.  The image
-        isn't used afterwards.
+        isn't used afterwards.  ``then``: :attr:`beside` as recorded of this frame, of which this is a replay.
         """
         self.learn()
+        self._repeats = then is not None
         if self._settings.bit_depth < 16:
             frame = in_full_scale(frame, self._settings.bit_depth)
         opening: object = frame.jaw_opening_m
         if isinstance(opening, np.generic):
             frame = replace(frame, jaw_opening_m=opening.item())  # NumPy's own numbers can't be written to files
         self._tick(frame)
-        faults = self._analysis.begin_frame(frame, self._now_s)
+        faults = self._analysis.begin_frame(frame, self._now_s, then)
         self._due += self._policy.stream(faults, self._now_s, frame.stamp_ns)
         refusal = inspect(frame, self._camera, self._gripper, self._analysis.stream.pixels) or frozen(faults)
         if refusal is not None:
@@ -197,7 +216,7 @@ class Monitor:
             return self._unmeasured(frame, reason, CornerFault.FRAME_REFUSED, of_stream(faults), refusal[0])
         # Where the gripper is, and by how much that may be off.
         before_T, rivals = self._cam_T_grip, self._trust.rivals(self._ref_cam_T_grip)
-        self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
+        self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals, then)
         if self.shadow is not None:
             self.shadow.see(frame, self._newest, self._now_s)
         standing = self._trust.judge(frame, self._newest, self._now_s)

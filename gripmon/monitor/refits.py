@@ -118,7 +118,7 @@ class Refits:
         """What may be wrong with a published pose, :meth:`away`, under the ``chosen`` hypotheses (h,) of probability
         ``prior`` (h,), by the frame alone or by the anchor too.
         """
-        fits, rows = self._free if anchored is None else anchored.fits, np.flatnonzero(chosen)
+        fits, rows = self._free if anchored is None else anchored.fits, chosen.nonzero()[0]
         return Cases(prior[rows], self.hypotheses.name, rows, rows, fits, away, self._floor)
 
     def knocked(self, prior: Array, knocks: Knocks, odds: tuple[float, float], least: float) -> Knocked:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb
-from gripmon.model.records import Array, EdgeEvidence, Frame, Image
-from gripmon.monitor.backlog import Backlog
+from gripmon.model.records import Array, Beside, EdgeEvidence, Frame, Image
+from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.track.differential import DegenerateGeometry, Update, differential_update
 from gripmon.track.edges import (
@@ -46,8 +47,12 @@ CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
 
 class GripperSearch:
     """Searches for a gripper that isn't seen, one search at a time in the background: started with one frame's image,
-    its result used in a later frame.  Only the first search after the gripper was lost runs within its frame: a
-    knocked gripper is found at once, and one frame is late.
+    its result used in a later frame.
+
+    Nobody waits for frames, unless they are ``live``: then the first search after the gripper was lost runs within its
+    frame, and the others are used a fixed time later.  A live frame waits for none: a result is used in the first one
+    after the search's end.  ``searches``, whether one began with the newest frame's image, and ``searched_seq``, the
+    number of the frame whose image the one used that is used in it, tell a replay of live frames how to repeat that.
 
     A doubtful fit may search further at the cost of a credit that good frames refill slowly.  A lost gripper is
     searched for continuously while the last transform is held, and then in one of several frames: it keeps moving, and
@@ -61,6 +66,11 @@ class GripperSearch:
         self._backlog: Backlog[Sequence[Expected]] = Backlog()
         self._found: Sequence[Expected] | None = None  # for the newest frame
         self._kept: tuple[Sequence[Expected], float] = (), 0.0  # found before a doubtful fit, and when
+        self.live = self.searches = False
+        self.searched_seq: int | None = None
+        self._seq = self._of_seq = 0  # of the newest frame, and of the one whose image is searched
+        self._within = True  # whether this frame may wait for a search
+        self._after_s = RESULT_AFTER_S
         self._now_s = self._seen_s = 0.0
         self._credit = float(settings.eager_frames)
         self._untrusted = 0  # frames since the gripper was seen
@@ -75,10 +85,22 @@ class GripperSearch:
         """Run the waiting searches; in any thread."""
         self._backlog.run()
 
-    def begin_frame(self, now_s: float) -> Patience:
-        """Whether this frame may look beyond where the gripper is expected.  Raises a failed search's exception."""
-        self._now_s, self._found = now_s, None
-        for found in self._backlog.results(now_s):
+    def begin_frame(self, seq: int, now_s: float, then: Beside | None = None) -> Patience:
+        """Whether this frame may look beyond where the gripper is expected.  Raises a failed search's exception.
+
+        ``then``: what is recorded of this frame, of which this is a replay.  A search that began in a recorded frame
+        lasts as long as it did then; one that a replay of other images began keeps to the frames' clock.
+        """
+        self._seq, self._now_s, self._found = seq, now_s, None
+        self._within, due_s, self._after_s = not self.live and then is None, now_s, RESULT_AFTER_S
+        if then is not None:
+            self._after_s = math.inf if then.searches else RESULT_AFTER_S
+            due_s = math.inf if then.searches or then.searched_seq is not None else now_s  # one search at a time
+        elif self.live:
+            self._after_s = 0.0
+        self.searches, self.searched_seq = False, None
+        for found in self._backlog.results(due_s, waits=not self.live):
+            self.searched_seq = self._of_seq
             if isinstance(found, Exception):
                 raise found
             self._found = found
@@ -86,7 +108,7 @@ class GripperSearch:
         kept, since_s = self._kept
         if kept and self._found is None and not self._untrusted and now_s - since_s <= self._hold_s:
             self._found = kept
-        at_once = not self._searched
+        at_once = not self._searched and self._within
         if self._found is not None or len(self._backlog):
             return Patience(self._found is not None, self._found is not None, at_once)
         held = now_s - self._seen_s <= self._hold_s
@@ -95,15 +117,15 @@ class GripperSearch:
 
     def places(self, image: Image, expected: Expected, sought: Sought) -> Sequence[Expected]:
         """Places to follow in this frame: those found by an earlier frame's search, or by this one's if the gripper was
-        just lost; else none, and a search starts with a copy of the image.
+        just lost and frames may wait; else none, and a search starts with a copy of the image.
         """
         if self._found is not None:
             return self._found
         first, self._searched = not self._searched, True
-        if sought.lost and first:
+        if sought.lost and first and self._within:
             return self._meter.searched(image, expected, sought)
-        kept = image.copy()
-        self._backlog.add(lambda: self._meter.searched(kept, expected, sought), self._now_s)
+        self.searches, self._of_seq, kept = True, self._seq, image.copy()
+        self._backlog.add(lambda: self._meter.searched(kept, expected, sought), self._now_s, self._after_s)
         return ()
 
     def end_frame(self, measurement: Measurement) -> None:
@@ -149,13 +171,20 @@ class Tracker:
         self.searching = GripperSearch(searcher, settings.corners.search, settings.policy.hold_s)
         self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
 
-    def measure(self, frame: Frame, cam_T_grip: Array, now_s: float, rivals: tuple[Array, ...] = ()) -> Measurement:
+    def measure(
+        self,
+        frame: Frame,
+        cam_T_grip: Array,
+        now_s: float,
+        rivals: tuple[Array, ...] = (),
+        then: Beside | None = None,
+    ) -> Measurement:
         """Measure around ``cam_T_grip`` (4, 4), where the gripper is expected, and look further if clearly fewer edge
         points than usual are inliers: at the ``rivals`` (4, 4) first.  An opening that isn't reported is expected to
-        be as measured last.
+        be as measured last.  ``then``: see :meth:`GripperSearch.begin_frame`.
         """
         assert frame.image is not None
-        patience = self.searching.begin_frame(now_s)
+        patience = self.searching.begin_frame(frame.seq, now_s, then)
         measurement = self._meter.measure(
             frame.image,
             cam_T_grip,

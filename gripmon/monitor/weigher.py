@@ -32,7 +32,7 @@ from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
-from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY
+from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY, least_known
 from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
@@ -79,7 +79,7 @@ class Weigher:
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
         self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
-        self._axis = tracker.finger_axis
+        self._axis, self._every = tracker.finger_axis, np.arange(len(self._lasting.name))
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
@@ -260,7 +260,7 @@ class Weigher:
         the reference's frames alone.
         """
         risk, anchor, (first, _) = self._policy.integrity_risk, self.anchor, fits.model.first
-        lasting, every = self._lasting, np.arange(len(self._lasting.name))
+        lasting, every = self._lasting, self._every
         ever, since = list[Cases](), list[tuple[Cases, NDArray[np.intp]]]()
         if anchor is not None and not displaced:
             rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
@@ -273,7 +273,9 @@ class Weigher:
         for _, found in wrong:
             left_out, count = left_out + found.left_out, count + len(found.prior)
         # Of what isn't probable enough to have a bound, whichever, the prior counts alone.
-        now = [stayed, *(of.after(stayed.away, knocks, found, (risk - left_out) / count) for of, found in wrong)]
+        now, share = [stayed], (risk - left_out) / count
+        for of, found in wrong:
+            now.append(of.after(stayed.away, knocks, found, share))
         of_motion = self._of_motion(now, since, fits, cam_T_grip, knocks, displaced)
         absolutely = fits.model.absolute([*now, *ever], cam_T_grip)
         return Bounds(protection_of(absolutely, risk, left_out), protection_of(of_motion, risk, left_out))
@@ -319,9 +321,7 @@ class Weigher:
         ones have one of their own beside that of the fingers; fingers without a direction have none.
         """
         axis = cam_T_grip[:3, :3] @ self._axis
-        least_known: Array = np.linalg.eigh(fits.covariance[fits.hypotheses.ends][:3, :3])[1][:, 2]
-        near = abs(float(least_known @ axis)) > PARALLEL_COSINE * np.linalg.norm(axis)
-        return Knocks.of(least_known if near else axis)
+        return Knocks.of(least_known(fits.covariance[fits.hypotheses.ends], axis, PARALLEL_COSINE))
 
     @property
     def _usual_motion(self) -> Array:

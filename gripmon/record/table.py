@@ -180,6 +180,10 @@ class FrameTable:
     )  # fmt: skip
     corners_total: NDArray[np.int32] = _column("1", "corners of the gripper file", lambda r: len(r.corners), np.int32)
     refused: NDArray[np.bool_] = _column("", "nothing was measured in this frame", lambda r: not r.measured, np.bool_)
+    searched_seq: IntArray = _whole(
+        "1", "number of the frame whose image the search used that counts from this one on; -1: none",
+        lambda r: -1 if r.beside is None or r.beside.searched_seq is None else r.beside.searched_seq,
+    )  # fmt: skip
     reference_ids: tuple[str, ...] = ()
 
     def __len__(self) -> int:

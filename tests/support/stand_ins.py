@@ -91,6 +91,9 @@ class ScriptedMonitor:
     def learn(self) -> None: ...
 
     pending = False
+    beside = None
+
+    def run_live(self) -> None: ...
 
     def run_pending(self) -> None: ...
 

@@ -42,7 +42,6 @@ class RingSource:
     ``between`` is called before each frame, outside of what is timed.
     """
 
-    live = False
     connected = True
     dropped = 0
 
@@ -59,6 +58,7 @@ class RingSource:
         self.handed_ns, self.published_ns, self.back_ns = (np.full(count, -1, np.int64) for _ in range(3))
         self.measured, self.tracking, self.valid = (np.full(count, False) for _ in range(3))
         self._ring, self._count, self._paced, self._between = ring, count, paced, between
+        self.live = paced  # of a camera, no frame of which waits for a search
         self._opening = opening
         self._seq = 0
         self._due_s = time.monotonic()

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from gripmon.model.compiled import compiled
 from gripmon.model.records import Array
+from gripmon.model.symmetric import diagonalise
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
-
-JACOBI_SWEEPS = 30
-"""Sweeps of Jacobi's rotations, of which some six suffice: each squares what is left."""
 
 
 @compiled
@@ -281,34 +279,8 @@ def learn(
 
 @compiled
 def _exceeding(matrix: Array, vectors: Array, out: Array) -> None:
-    """The positive part ``out`` of a symmetric (6, 6) matrix, which is overwritten: by Jacobi's rotations."""
-    vectors[:] = 0.0
-    for i in range(6):
-        vectors[i, i] = 1.0
-    for _ in range(JACOBI_SWEEPS):
-        rest, whole = 0.0, 0.0
-        for i in range(6):
-            whole += matrix[i, i] * matrix[i, i]
-            for j in range(i):
-                rest += matrix[i, j] * matrix[i, j]
-        if rest <= 1e-30 * whole:
-            break
-        for p in range(5):
-            for q in range(p + 1, 6):
-                if matrix[p, q] == 0.0:
-                    continue
-                theta = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
-                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + math.sqrt(theta * theta + 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
-                for i in range(6):
-                    a, b = matrix[i, p], matrix[i, q]
-                    matrix[i, p], matrix[i, q] = c * a - s * b, s * a + c * b
-                for i in range(6):
-                    a, b = matrix[p, i], matrix[q, i]
-                    matrix[p, i], matrix[q, i] = c * a - s * b, s * a + c * b
-                    a, b = vectors[i, p], vectors[i, q]
-                    vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
+    """The positive part ``out`` of a symmetric (6, 6) matrix, which is overwritten."""
+    diagonalise(matrix, vectors)
     out[:] = 0.0
     for k in range(6):
         if matrix[k, k] > 0.0:

@@ -61,6 +61,11 @@ class AlertBook:
         return tuple(OpenAlert(topic, entry.alert) for topic, entry in self._open.items())
 
     @property
+    def any(self) -> bool:
+        """Whether something is raised and not cleared."""
+        return bool(self._open)
+
+    @property
     def raised(self) -> int:
         """How many alerts there were."""
         return self._raised

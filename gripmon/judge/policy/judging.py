@@ -308,6 +308,8 @@ class Policy:
         book, motion, probable = self.alerts, evidence.motion, evidence.explanation.confirmed_cause
         not_the_camera = probable.cause in NOT_THE_CAMERA
         since = self._unproven_since
+        if not (book.any or moved or not_the_camera or motion.vibration or since):
+            return ()  # usually: nothing to raise, to update or to clear
         if since is not None and now_s - since[0] >= self._settings.hold_s:
             # As long as a transform is held of which nothing is seen.
             text = unproven_text(since[1])

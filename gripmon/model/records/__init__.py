@@ -28,6 +28,7 @@ from gripmon.model.records.commands import (
 )
 from gripmon.model.records.evidence import EdgeEvidence, EdgeSums
 from gripmon.model.records.frames import (
+    Beside,
     CornerFault,
     CornerRecord,
     Frame,
@@ -79,6 +80,7 @@ __all__ = [
     "AlertRecord",
     "Array",
     "AtReferenceRecord",
+    "Beside",
     "Cause",
     "CauseWeight",
     "ClockReading",

@@ -120,6 +120,17 @@ class CornerRecord(msgspec.Struct, frozen=True):
     reason: Annotated[CornerFault | None, Meta(description="why it was not measured or used; null if it was")] = None
 
 
+class Beside(msgspec.Struct, frozen=True, gc=False):
+    """What one frame had to do with the work that goes on beside the frames of a live camera."""
+
+    searches: Annotated[bool, Meta(description="a search for the gripper began with this frame's image")] = False
+    searched_seq: Annotated[
+        int | None,
+        Meta(description="number of the frame whose image the search used that counts from this one on; null: none"),
+    ] = None
+    analysed: Annotated[int, Meta(description="steps of the cause analysis that count from this one on")] = 0
+
+
 class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.transform/2"):
     """What the monitor decided about one frame: also one line of ``replay``."""
 
@@ -169,6 +180,9 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         SinceReference | None, Meta(description="null with cam_T_grip, and until a frame proves where the gripper is")
     ] = None
     absolute: Annotated[Absolute | None, Meta(description="null with cam_T_grip")] = None
+    beside: Annotated[
+        Beside | None, Meta(description="null where frames wait for that work: in a replay of images, for one")
+    ] = None
 
     @property
     def measured(self) -> bool:

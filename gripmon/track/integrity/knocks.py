@@ -10,6 +10,7 @@ show has its own share, so that it isn't taken for improbable because it is spec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from gripmon.model.compiled import compiled
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
+from gripmon.model.symmetric import diagonalise
 
 ANY_SHARE = (0.40, 0.45, 0.15)
 ANY_SIGMA_M = (1.3e-3, 2.6e-3, 5.5e-3)
@@ -66,7 +69,7 @@ class Knocks(NamedTuple):
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        length, kinds = float(np.linalg.norm(axis_cam)), len(ANY_SHARE)
+        length, kinds = math.sqrt(float(axis_cam @ axis_cam)), len(ANY_SHARE)
         if length == 0.0:
             return cls(np.array(ANY_SHARE), _BY_KIND.covariance[:kinds], _BY_KIND.along[:kinds])
         covariance, way = _BY_KIND.covariance.copy(), axis_cam / length
@@ -87,6 +90,23 @@ _BY_KIND = Knocks(
     ),
     np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
 )
+
+
+@compiled
+def least_known(covariance: Array, axis: Array, cosine: float) -> Array:
+    """(3,) the direction in which a fit with the ``covariance`` (6, 6) knows a position least, if its angle to the
+    ``axis`` (3,) has more than this ``cosine``; else the axis.
+    """
+    matrix, vectors, most = covariance[:3, :3].copy(), np.empty((3, 3)), 0
+    diagonalise(matrix, vectors)
+    for k in range(1, 3):
+        if matrix[k, k] > matrix[most, most]:
+            most = k
+    along, length = 0.0, 0.0
+    for k in range(3):
+        along += vectors[k, most] * axis[k]
+        length += axis[k] * axis[k]
+    return vectors[:, most].copy() if abs(along) > cosine * math.sqrt(length) else axis
 
 
 def swinging(swing: Array, way: Array, noise: Array) -> Array:

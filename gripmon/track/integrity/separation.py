@@ -22,7 +22,7 @@ from scipy.special import chdtri
 
 from gripmon.model.records import Array
 from gripmon.track.integrity import kernel, level_kernel
-from gripmon.track.integrity.knocks import Knocks
+from gripmon.track.integrity.knocks import Knocks, least_known
 
 LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
@@ -326,7 +326,7 @@ def warm_up() -> None:
         _, at, fits, _, _ = refitted(*made, 1.0)
     averages, _ = follow(fits, fits, none)
     before = at, np.eye(6), fits.of_model[0]
-    knocks = Knocks.of(none[:3])
+    knocks = Knocks.of(least_known(np.eye(6), np.ones(3), 0.0))
     found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
     after_knocks(fits, before, knocks, found, 0.0)
     told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))

@@ -162,7 +162,7 @@ class FingerStrips:
         self._prepare(self._layout)
         usual = self._alike(self._layout, image, cam_T_grip, jaw_opening_m)
         self._usual += (usual - self._usual) / min(self.frames, MOST_FRAMES)
-        self._farther = _farther_on(self._usual)
+        self._know_farther()
 
     def state(self) -> StripsRecord | None:
         """What survives a restart, some 10 kB; None before a frame was learned."""
@@ -185,7 +185,7 @@ class FingerStrips:
             raise StripsRefused("the kept strips along the fingers aren't this gripper's; they are learnt again")
         self._mean = np.frombuffer(record.mean, "<f4").reshape(layout.within.shape).astype(np.float32)
         self._usual = np.frombuffer(record.usual, "<f4").astype(float)
-        self._farther = _farther_on(self._usual)
+        self._know_farther()
         self.frames = record.frames
         self._prepare(layout)
 
@@ -196,31 +196,32 @@ class FingerStrips:
         layout = self._layout
         if layout is None or not self.ready:
             return StripsSeen()
-        alike_here = self._alike_here(layout, self._read(layout, image, cam_T_grip, jaw_opening_m))
-        independent = _independent(layout.within)
+        independent = self._independent
         # By how much more of the variance a slide has to explain.
         beyond_chance = math.exp(2.0 / independent * math.log((2 * REACH_PX + 1) / risk))
-        farther = self._farther
-        alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - float(farther.max()) ** 2
+        farthest = self._farthest
+        alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - farthest**2
         most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
-        if alone and alike_here >= most_alike:
-            return StripsSeen(here=True)  # usually: no slide could be better
+        if alone:
+            strips = self._read(layout, image, cam_T_grip, jaw_opening_m)
+            if self._alike_here(layout, strips) >= most_alike:
+                return StripsSeen(here=True)  # usually: no slide could be better
         unexplained = _unexplained(self._alike(layout, image, cam_T_grip, jaw_opening_m), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = float(unexplained.min())
         # What looks alike farther on is always seen there, and alone where the place itself is hidden.
-        unexplained[beyond_chance * unexplained >= _unexplained(farther, most_alike)] = 1.0
+        unexplained[beyond_chance * unexplained >= self._farther_left[most_alike]] = 1.0
         slide_px = int(np.argmin(unexplained)) - REACH_PX
         if here > beyond_chance * float(unexplained.min()):
             if independent < FEWEST_POINTS:
                 return StripsSeen()
             return StripsSeen(slide_px * layout.step_m.mean(axis=0))
         # Where a rib or a thread looks alike farther on, strips never confirm a place: one more or less is little.
-        confirmed = beyond_chance * here <= best and float(farther.max()) <= EXPLAINED_CORRELATION
+        confirmed = beyond_chance * here <= best and farthest <= EXPLAINED_CORRELATION
         # Odds of ten to one for this slide; what hides a part of them leaves less.  One of the places that look alike
         # is seen no better than they are from the place itself, whichever of them is the best now.
-        rival = min(best, float(_unexplained(farther.max(), most_alike)))
+        rival = min(best, 1.0 - min(farthest, most_alike) ** 2)
         as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= rival
         return StripsSeen(here=confirmed, undecided=not alone and independent >= FEWEST_POINTS and as_well)
 
@@ -237,8 +238,16 @@ class FingerStrips:
         least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
         return np.asarray(product / np.sqrt(np.maximum(energy, least) * self._own + 1e-12))
 
+    def _know_farther(self) -> None:
+        """What a comparison needs of the usual correlations."""
+        farther = _farther_on(self._usual)
+        self._farthest = float(farther.max())
+        self._farther_left = {most: _unexplained(farther, most) for most in (EXPLAINED_CORRELATION, 1.0)}
+
     def _prepare(self, layout: _Layout) -> None:
         """What a comparison needs of the mean."""
+        # Strips side by side show the same.
+        self._independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
         self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
         self._learnt = np.clip(self._mean, -self._most, self._most)
         self._own = float(np.square(self._learnt).sum())
@@ -395,11 +404,6 @@ def _followed(
     return place[0], place[1], largest
 
 
-def _independent(within: NDArray[np.float32]) -> float:
-    """Number of independent points ``within`` (n, LENGTH_PX) the fingers; strips side by side show the same."""
-    return float(within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
-
-
 def _farther_on(alike: Array) -> Array:
     """Correlations at each slide, zero from the place itself to where they are first no longer alike: what is left is
     of something else that looks alike.
@@ -411,9 +415,9 @@ def _farther_on(alike: Array) -> Array:
     return out
 
 
-def _unexplained(alike: Any, most_alike: float) -> Any:
+def _unexplained(alike: Array, most_alike: float) -> Array:
     """Part of the variance that correlations leave, none being better than ``most_alike``."""
-    return 1.0 - np.square(np.clip(alike, 0.0, most_alike))
+    return np.asarray(1.0 - np.square(np.clip(alike, 0.0, most_alike)))
 
 
 @lru_cache(maxsize=4)
