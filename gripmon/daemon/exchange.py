@@ -33,7 +33,7 @@ def import_calibration(
     hand/eye transform's frames; ``command`` is for the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
     file = given_file(path)
-    if file.own or file.is_lens:
+    if file.own or file.lens is not None:
         raise InputError(f"{path}: is a file of gripmon's, which its commands take as it is; another program's")
     made = provenance_of(command, [file.input])
     hand_eye = read_hand_eye(file.document, which=which)
