@@ -277,7 +277,9 @@ def test_what_rs_enumerate_devices_prints_is_a_camera_s_file():
 def test_every_command_takes_the_file_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The readers behind --camera, --lens, a configuration's camera, verify and export are these two."""
     color = json.dumps(REALSENSE["color"])
-    for name, text in (("cameras.txt", COLMAP.split("\n")[3]), ("a.json", color), ("b.yaml", VINS)):
+    section = json.dumps({"camera": REALSENSE["color"]})  # as gripmon's own section is called
+    files = (("cameras.txt", COLMAP.split("\n")[3]), ("a.json", color), ("c.yaml", section), ("b.yaml", VINS))
+    for name, text in files:
         path, out = tmp_path / name, tmp_path / f"{name}.xml"
         path.write_text(text)
         found = read_camera(text.encode(), "x").camera

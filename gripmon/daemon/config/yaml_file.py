@@ -68,7 +68,7 @@ class GivenFile:
         if self._has("fx_px"):
             return self.values
         section = self.values.get("camera") if self._has("camera") else None
-        alone = isinstance(section, dict) and len(self.values) == 1
+        alone = isinstance(section, dict) and "fx_px" in section and len(self.values) == 1
         return section if alone else None
 
     def _has(self, key: str) -> bool:
