@@ -23,7 +23,7 @@ def sure(still: np.ndarray) -> Edges:
     """All borders of a mask stay in all images."""
     border = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     share = border.astype(np.float32)
-    return Edges(share, np.zeros(SHAPE, np.float32), border, (~still).astype(np.float32))
+    return Edges(share, np.zeros(SHAPE, np.float32), border, ~still, 0.1)
 
 
 LEFT = [(60, 239), (70, 120), (100, 120), (100, 239)]
@@ -118,47 +118,10 @@ def test_a_small_face_on_which_shadows_come_and_go_is_the_grippers():
         shadow = np.zeros(SHAPE, np.float32)
         shadow[:, 106:112] = 60.0 if k % 4 <= 1 else 0.0
         shown.append(picture + face * (50.0 + shadow))
-    found = enclosed(edges_that_stay(shown))
-    assert found is not None and found[own].mean() > 0.7
-
-
-def test_a_gripper_is_enclosed_before_plain_rooms_also_with_play():
-    """Few edges come and go before plain walls; half a pixel of play lets the gripper's own seem to."""
-    still = rolled_hand(6.0)
-    rng = np.random.default_rng(3)
-    shown = []
-    for _ in range(16):
-        back = np.full(SHAPE, rng.uniform(60.0, 200.0), np.float32)
-        for _ in range(3):
-            at, size = rng.uniform((0, 0), SHAPE[::-1]), rng.uniform(15.0, 120.0, 2)
-            box = cv2.boxPoints((at, size, rng.uniform(0.0, 180.0)))
-            cv2.fillPoly(back, [box.round().astype(np.int32)], float(rng.uniform(30.0, 230.0)))
-        own = np.where(np.indices(SHAPE)[0] > 150, 190.0, 90.0) * rng.uniform(0.9, 1.1)
-        image = cv2.GaussianBlur(np.where(still, own, back).astype(np.float32), (0, 0), 0.8)
-        play = np.float32([[1.0, 0.0, rng.normal(0.0, 0.5)], [0.0, 1.0, rng.normal(0.0, 0.5)]])
-        image = cv2.warpAffine(image, play, SHAPE[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        shown.append(image + rng.normal(0.0, 1.0, SHAPE).astype(np.float32))
-    found = enclosed(edges_that_stay(shown))
-    assert found is not None
-    assert (found & still).sum() > 0.95 * still.sum()
-    assert (found & ~still).sum() < 0.05 * still.sum()
-
-
-def test_threads_of_one_direction_hardly_stay_and_change():
-    """A fabric in half of six images, turned by some 15 degrees: edges of one direction are no rarity in it."""
-    rng = np.random.default_rng(3)
-    shown = []
-    for _ in range(6):
-        woven = cv2.GaussianBlur(rng.normal(size=(480, 480)), (0, 0), sigmaX=1.2, sigmaY=10.0)
-        turn = cv2.getRotationMatrix2D((240.0, 240.0), rng.normal(0.0, 15.0), 1.0)
-        woven = cv2.warpAffine(woven / woven.std(), turn, (480, 480))[120:360, 160:320]
-        image = np.full(SHAPE, rng.uniform(60.0, 200.0)) + rng.normal(0.0, 1.0, SHAPE)
-        image[:, 160:] += 8.0 * woven
-        shown.append(image.astype(np.float32))
     edges = edges_that_stay(shown)
-    # By the chance of the whole image, which is plain in its other half, 0.18 and 0.00.
-    assert edges.stays[:, 180:].mean() < 0.1
-    assert np.nanmean(edges.changing[:, 180:]) > 0.4
+    assert 0.3 < edges.changing[own].mean() < 0.5 * edges.most_changing
+    found = enclosed(edges)
+    assert found is not None and found[own].mean() > 0.7
 
 
 def test_nothing_is_enclosed_where_nothing_changes():
@@ -181,7 +144,7 @@ def mask(*corners: list[tuple[int, int]]) -> np.ndarray:
 def found(still: np.ndarray, count: int | None = None) -> Parts:
     """Where an edge is anywhere, so that only the shapes tell."""
     ones = np.ones(still.shape, np.float32)
-    return find_fingers(still, Edges(ones, ones, ones > 0.0, 0.0 * ones), count)
+    return find_fingers(still, Edges(ones, ones, ones > 0.0, ones < 0.0, 0.1), count)
 
 
 @pytest.mark.parametrize("other", [CROSSING_CABLE, HOUSING])

@@ -1,20 +1,15 @@
-"""Images that show the gripper displaced are moved back, what stays beyond an edge is told from background, and an
-outline doesn't depend on the mask's contour.
-"""
+"""Images that show the gripper displaced are moved back, and what stays beyond an edge is told from background."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from support.changing_backgrounds import CAMERA, beside_truth_px, coverage, images_of, moving_robot
+from support.changing_backgrounds import CAMERA
 
 from gripmon.model.staying import Edges
-from gripmon.teach import image_outline
-from gripmon.teach.image_outline import _displaced, _moved_back, see_opening
-from gripmon.teach.matte import Matte, find_matte, grey_levels
+from gripmon.teach.image_outline import _displaced, _moved_back
+from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost
 from gripmon.teach.straight_pieces import _joined, _Line
 
@@ -36,9 +31,9 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     seen[0] = ((uv_px @ matrix[:, :2].T + matrix[:, 2] - uv_px) * normal).sum(axis=1)
     usable = uv_px[:, 0] > 180.0
     none = np.zeros(len(angle))
-    found = Transitions(none, none[None], usable, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
+    found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
     flat = np.zeros(shape, np.float32)
-    edges = Edges(flat, flat, flat > 0, flat)
+    edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
     matte = Matte(flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})
 
     back = _moved_back(matte, _displaced(stations, found), uv_px[usable]).images
@@ -84,31 +79,3 @@ def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() ->
     chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
     assert not chain.corner.any()
     assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01
-
-
-@pytest.fixture(scope="module")
-def standing() -> tuple[np.ndarray, Matte]:
-    """What the gripper hides, and seven images of it."""
-    simulator = moving_robot(301)
-    images = [grey_levels(image) for image in images_of(simulator)[2::4][:7]]
-    return coverage(simulator), find_matte(images, 0.3)
-
-
-@pytest.mark.parametrize(("outside_px", "wavers_px"), [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, 4.0)])
-def test_an_outline_is_right_whatever_contour_beside_it_the_mask_has(
-    standing: tuple[np.ndarray, Matte], monkeypatch: pytest.MonkeyPatch, outside_px: float, wavers_px: float
-) -> None:
-    """2 px outside or inside of the fingers, or wavering between these; a tenth was beside the background's edges."""
-    covered, matte = standing
-    own = (covered > 0.5).astype(np.uint8)
-    depth_px = cv2.distanceTransform(own, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - own, cv2.DIST_L2, 5)
-    wavering = np.zeros(own.shape)
-    if wavers_px:
-        noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=own.shape), (0, 0), wavers_px)
-        wavering = np.clip(noise / noise.std(), -2.0, 2.0)
-    mask = depth_px > wavering - outside_px
-    monkeypatch.setattr(image_outline, "find_matte", lambda *_: replace(matte, still=mask))
-    seen = see_opening(CAMERA, [covered] * len(matte.kept), 0.3)
-    away = beside_truth_px([chain for finger in seen.fingers for chain in finger.chains], covered)
-    assert len(away) > 1000 and np.median(away) < 0.05
-    assert np.quantile(away, 0.95) < 0.2 and np.mean(away > 1.0) < 0.005

@@ -8,13 +8,11 @@ whatever its contrast, and doubled angles, since a background may be darker or b
 
 is the share of the n images that show an edge of one direction there: 1 on an outline, some 1 / sqrt(n) where
 directions are random (the mean resultant length of circular statistics; Mardia and Jupp, *Directional Statistics*,
-2000).  How large it is by chance around there, as on fabric, whose threads have one direction, is measured in these
-very images, with each displaced by another amount; what counts is how far from that to all images the share is.
+2000).  How large it is by chance in these very images is measured: with each image displaced by another amount.
 
-Small cells of the image, divided by such edges, are then merged: across the weakest common boundary first.  Cells that
-edges cross which don't stay are background from the beginning; a cell filled by edges that stay can't show any, which
-tells nothing about it.  What no boundary without an edge joins to the
-background is the gripper.  A gap in an outline does little, since a boundary counts by its mean along its whole length.
+Small cells of the image, divided by such edges, are then merged: across the weakest common boundary first, and cells in
+which edges come and go are background from the beginning.  What no boundary without an edge joins to the background is
+the gripper.  A gap in an outline does little, since a boundary counts by its mean along its whole length.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ import heapq
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -42,29 +39,21 @@ LEAST_SLOPE = 2.0
 NOISE_SLOPES = 3.0
 """The same, in the slopes that noise alone makes: one in a hundred of these is larger (Rayleigh: exp(-4.5))."""
 STAYING_PART = 0.35
-"""Share, between chance (0) and all images (1), from which an edge stays: a third of the images may show something else
-there."""
+"""Where between chance (0) and all images (1) an edge stays: a third of the images may show something else there."""
 CHANGING_SLOPES = 4.0
-"""Slope of an edge that comes and goes, over noise's: noise exceeds it in one pixel of 3,000 (Rayleigh: exp(-8))."""
-CHANGING_FACTOR = 1.5
-"""... and over the slope that two thirds of the images show there: a faint edge that stays, under another light."""
-BESIDE_PX = 2
-"""How far beside an edge that stays one counts as the same: it is as wide as its blur and the mount's play make it."""
+"""Slope that a fifth of the images show, over noise's: noise exceeds it in one of 3,000 (Rayleigh: exp(-8))."""
+CHANGING_FACTOR = 2.5
+"""... and over the slope that two thirds of the images show, which on a standing edge is about the same."""
 CHANGING_PART = 0.3
-"""Part of the images in which edges come and go in a cell, from which it is background.  At most half of what the tenth
-of the image has that changes most: a background of few edges."""
-LEAST_CHANGING = 0.1
-"""Least part of the images in which edges come and go there; noise alone makes none."""
-CHANGE_WORTH = 0.2
+"""Part of a cell where edges come and go, from which it is background: a thin finger fills two thirds of a cell.  At
+most half of what the tenth of the cells has that changes most: a background of few edges."""
+LEAST_CHANGING = 0.02
+"""Least part of these cells where edges come and go; noise alone makes a thousandth."""
+CHANGE_WORTH = 0.3
 """What a boundary between a cell where everything changes and one where nothing does counts over an edge that stays in
-all images: by itself, as where a wall begins, and with a tenth that directions agree more than usual by chance, less
-than :data:`STAYING_PART` asks for."""
+all images: by itself, as where a wall begins, less than :data:`STAYING_PART` asks for."""
 CELL_PX = 14
 """Side of a cell: its boundary is twice the shortest edge of 8 px that is measured, so that one edge divides it."""
-LEAST_CELL_PX = CELL_PX**2 / 4
-"""Area of a cell, px, without the edges in it: of a smaller one the ends of edges are most of the boundary."""
-AROUND_PX = 3.0 * CELL_PX
-"""Around a pixel, where chance is measured: so far that even the widest edge is elsewhere, and a texture the same."""
 SHORT_PENALTY = 0.3
 """Added to the strength of a boundary as long as a cell's side; boundaries n times as long get 1 / sqrt(n) of it: the
 scatter of a mean of n, so that of two equal boundaries the better known one is opened first."""
@@ -76,28 +65,34 @@ _BAND_VALUES = 8e6
 
 @dataclass(frozen=True)
 class Edges:
-    """What the images (n, h, w) show of edges: ``share`` (h, w) of the images with an edge of one direction, from 0, as
-    by chance around there, to 1; ``across_rad`` (h, w), that direction of the gradient, modulo pi; ``ridge`` (h, w),
-    where the slope has its maximum across; ``changing`` (h, w), the part of the images in which edges that don't stay
-    cross a pixel's cell, NaN beside an edge that stays; ``slope`` (h, w), the one that all but a third of the images
-    exceed, grey levels a pixel.
+    """What the images (n, h, w) show of edges: ``share`` (h, w), 0 to 1, of the images with an edge of one direction;
+    ``across_rad`` (h, w), that direction of the gradient, modulo pi; ``ridge`` (h, w), where the slope has its maximum
+    across; ``changing`` (h, w), where edges come and go; ``by_chance``, the mean share by chance; ``slope`` (h, w), the
+    one that all but a third of the images exceed, grey levels a pixel.
     """
 
     share: Plane
     across_rad: Plane
     ridge: Bits
-    changing: Plane
+    changing: Bits
+    by_chance: float
     slope: Plane = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+
+    @property
+    def limit(self) -> float:
+        """Share from which an edge stays."""
+        return self.by_chance + STAYING_PART * (1.0 - self.by_chance)
 
     @property
     def stays(self) -> Bits:
         """Ridges (h, w) that stay, one or two pixels wide."""
-        return np.asarray((self.share > STAYING_PART) & self.ridge)
+        return np.asarray((self.share > self.limit) & self.ridge)
 
     @property
     def most_changing(self) -> float:
-        """Part of the images in which edges come and go in the tenth of the image that changes most."""
-        return float(np.nanquantile(self.changing, 0.9))
+        """Part of the tenth of the image that changes most where edges come and go."""
+        part = cv2.blur(self.changing.astype(np.float32), (CELL_PX, CELL_PX))
+        return float(np.quantile(part, 0.9))
 
     @property
     def strength(self) -> Plane:
@@ -108,37 +103,16 @@ class Edges:
 
 def edges_that_stay(images: Sequence[Plane]) -> Edges:
     """Of ``images`` (h, w), grey levels of 0 to 255, at one jaw opening."""
-    usual = _usual(images)
+    usual, high = _quantiles(images)
     # The quietest fiftieth is a plain part of a fingertip or a wall; a third of a Rayleigh's values are below 0.93 s.
     quiet = float(np.quantile(cv2.blur(usual, (9, 9))[::3, ::3], 0.02))
     noise = max(quiet / 0.93, LEAST_SLOPE / 8.0)
     full = max(NOISE_SLOPES * noise, LEAST_SLOPE)
     share, across_rad = _share(images, full)
-    chance = _share(_displaced(images), full)[0]
-    by_chance, square = (cv2.GaussianBlur(part, (0, 0), 0.5 * AROUND_PX) for part in (chance, chance * chance))
-    high = by_chance + np.sqrt(np.maximum(square - by_chance * by_chance, 0.0))
-    likely = share > high + 0.5 * STAYING_PART * (1.0 - high)
-    share = np.maximum((share - by_chance) / (1.0 - by_chance), 0.0)
-    edges = Edges(share, across_rad, _ridge(usual, across_rad), np.zeros_like(share), usual)
-    return replace(edges, changing=_changing(images, edges, likely, max(CHANGING_SLOPES * noise, LEAST_SLOPE)))
-
-
-def _changing(images: Sequence[Plane], edges: Edges, likely: Bits, least_slope: float) -> Plane:
-    """Part (h, w) of the images in which edges of at least a slope cross a pixel's cell, along half of a cell's side:
-    not beside those that stay, nor along what is ``likely`` to stay, nor where there usually is one.
-    """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BESIDE_PX + 1,) * 2)
-    on, beside = (cv2.dilate(part.astype(np.uint8), disc) > 0 for part in (edges.stays, likely))
-    usual = np.cos(2.0 * edges.across_rad), np.sin(2.0 * edges.across_rad)
-    least = np.square(np.maximum(least_slope, CHANGING_FACTOR * edges.slope))
-    labels = _cells(edges.stays)
-    crossed = np.zeros(int(labels.max()) + 1)
-    for image in images:
-        x, y = gradient(image)
-        along = (x * x - y * y) * usual[0] + 2.0 * x * y * usual[1] > 0.0
-        edge = (x * x + y * y > least) & ~on & ~(beside & along)
-        crossed += np.bincount(labels[edge], minlength=len(crossed)) >= CELL_PX // 2
-    return np.where(on, np.nan, np.asarray(crossed / len(images), np.float32)[labels])
+    chance, _ = _share(_displaced(images), full)
+    changing = (high > CHANGING_SLOPES * noise) & (high > CHANGING_FACTOR * usual)
+    edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()), usual)
+    return replace(edges, changing=changing & (share < max(edges.limit, 0.6)))
 
 
 def gradient(image: Plane) -> tuple[Plane, Plane]:
@@ -156,14 +130,11 @@ def doubled(image: Plane, full: float) -> tuple[Plane, Plane]:
 
 
 def _displaced(images: Sequence[Plane]) -> Iterator[Plane]:
-    """The images, each displaced by another amount, so that nothing stays; what comes in mirrors the image."""
+    """The images, each rolled by another amount, so that nothing stays."""
     rng = np.random.default_rng(0)
+    height, width = images[0].shape
     for image in images:
-        away, angle = rng.uniform(CELL_PX, AROUND_PX), rng.uniform(0.0, 2.0 * math.pi)
-        matrix = np.array([[1.0, 0.0, away * math.cos(angle)], [0.0, 1.0, away * math.sin(angle)]])
-        size = (image.shape[1], image.shape[0])
-        moved = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT_101)
-        yield np.asarray(moved, np.float32)
+        yield np.roll(image, (int(rng.integers(height)), int(rng.integers(width))), (0, 1))
 
 
 def _share(images: Sequence[Plane] | Iterator[Plane], full: float) -> tuple[Plane, Plane]:
@@ -177,18 +148,19 @@ def _share(images: Sequence[Plane] | Iterator[Plane], full: float) -> tuple[Plan
     return np.asarray(np.hypot(cosine, sine), np.float32), np.asarray(0.5 * np.arctan2(sine, cosine), np.float32)
 
 
-def _usual(images: Sequence[Plane]) -> Plane:
-    """Slopes (h, w) that all but a third of the images exceed; by rows, to save memory."""
+def _quantiles(images: Sequence[Plane]) -> tuple[Plane, Plane]:
+    """Slopes (h, w) that all but a third, and that a fifth of the images exceed; by rows, to save memory."""
     count, (height, width) = len(images), images[0].shape
-    usual = np.empty((height, width), np.float32)
+    low, high = int(0.35 * (count - 1)), round(0.8 * (count - 1))
+    usual, upper = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     rows = max(32, int(_BAND_VALUES / (count * width)))
     margin = 6
     for top in range(0, height, rows):
         first, last = max(top - margin, 0), min(top + rows + margin, height)
         slopes = np.stack([np.hypot(*gradient(image[first:last])) for image in images])
         slopes = slopes[:, top - first : min(top + rows, height) - first]
-        usual[top : top + rows] = of_ranks(slopes, (int(0.35 * (count - 1)),))[0]
-    return usual
+        usual[top : top + rows], upper[top : top + rows] = of_ranks(slopes, (low, high))
+    return usual, upper
 
 
 def _ridge(slope: Plane, across_rad: Plane) -> Bits:
@@ -206,19 +178,21 @@ def enclosed(edges: Edges) -> Bits | None:
     """The pixels (h, w) that edges which stay separate from the background; None where nothing changes."""
     labels = _cells(edges.stays)
     count = int(labels.max()) + 1
-    shown = ~np.isnan(edges.changing)
-    shown_px = np.bincount(labels.ravel(), shown.ravel(), minlength=count)
-    crossed = np.bincount(labels.ravel(), np.where(shown, edges.changing, 0.0).ravel(), minlength=count)
-    changing = np.asarray(crossed / np.maximum(shown_px, 1), float)
-    most = edges.most_changing
+    area = np.bincount(labels.ravel(), minlength=count)
+    changing = np.bincount(labels.ravel(), edges.changing.ravel(), minlength=count) / np.maximum(area, 1)
+    most = float(np.quantile(changing, 0.9))
     if most < LEAST_CHANGING:
         return None
-    one, other, total, length_px = _boundaries(labels, edges.strength)
-    known = np.minimum(2.0 * shown_px / CELL_PX**2, 1.0)
-    known = np.minimum(known[one], known[other])
-    total += CHANGE_WORTH * known * length_px * np.abs(changing[one] - changing[other])
-    start = np.where(changing > min(CHANGING_PART, 0.5 * most), 0, np.arange(count))
-    return np.asarray(_merged(one, other, total, length_px, start)[labels] != 0)
+    one, other, total, length_px = _boundaries(labels, edges)
+    changes = changing > min(CHANGING_PART, 0.5 * most)
+    joined = changes[one] & changes[other] & (total <= edges.limit * length_px)
+    parts = coo_array((np.ones(np.count_nonzero(joined)), (one[joined], other[joined])), shape=(count, count))
+    part = connected_components(parts, directed=False)[1]
+    # What edges that stay cut off from a cell may as well be a shadow, unless it changes like most of the background.
+    changes &= (np.bincount(part, area, minlength=count)[part] >= CELL_PX**2) | (changing > 0.5 * most)
+    total += CHANGE_WORTH * length_px * np.abs(changing[one] - changing[other])
+    start = np.where(changes, 0, np.arange(count))
+    return np.asarray(_merged(one, other, total, length_px, start, edges.limit)[labels] != 0)
 
 
 def _cells(stays: Bits) -> NDArray[np.int64]:
@@ -233,7 +207,6 @@ def _cells(stays: Bits) -> NDArray[np.int64]:
             found, own = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
             labels[part] = own[part] + count
             count += found - 1
-    labels = _without_slivers(labels)[labels]
     taken = (~free).astype(np.uint8)
     _, nearest = cv2.distanceTransformWithLabels(taken, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(nearest.max()) + 1, np.int64)
@@ -241,25 +214,11 @@ def _cells(stays: Bits) -> NDArray[np.int64]:
     return np.asarray(table[nearest])
 
 
-def _without_slivers(labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """New labels (c,) of cells, 0 none: what an edge cuts off a square joins the cell that it touches most."""
-    area = np.bincount(labels.ravel())
-    one, other, _, length_px = _boundaries(labels, labels)
-    between = one > 0
-    one, other = np.hstack([one[between], other[between]]), np.hstack([other[between], one[between]])
-    order = np.lexsort((np.tile(length_px[between], 2), one))
-    one, other = one[order], other[order]
-    joins = np.append(one[1:] != one[:-1], True) & (area[one] < LEAST_CELL_PX)
-    graph = coo_array((joins[joins], (one[joins], other[joins])), shape=(len(area), len(area)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
-
-
-def _boundaries(
-    labels: NDArray[np.int64], strength: NDArray[Any]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
-    """Pairs of neighbouring cells (b,) and (b,), the sum of the edges' strengths (h, w) along their common boundary,
-    and its length, px.
+def _boundaries(labels: NDArray[np.int64], edges: Edges) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Pairs of neighbouring cells (b,) and (b,), the sum of the edges' shares along their common boundary, and its
+    length, px.
     """
+    strength = edges.strength
     count = int(labels.max()) + 1
     keys, values = [], []
     for here, there in (
@@ -282,6 +241,7 @@ def _merged(
     total: Array,
     length_px: Array,
     start: NDArray[np.int64],
+    limit: float,
 ) -> NDArray[np.int64]:
     """The region (c,) of each cell, 0 the background; ``start`` (c,): cells that begin as one."""
     around: list[dict[int, tuple[float, float]]] = [{} for _ in start]
@@ -299,7 +259,7 @@ def _merged(
     parent = np.arange(len(start))
     while heap:
         _, a, b, seen = heapq.heappop(heap)
-        if around[a].get(b) != seen or seen[0] > STAYING_PART * seen[1]:
+        if around[a].get(b) != seen or seen[0] > limit * seen[1]:
             continue
         if a != 0 and len(around[b]) > len(around[a]):
             a, b = b, a

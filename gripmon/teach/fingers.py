@@ -13,7 +13,7 @@ import numpy as np
 
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array, Image
-from gripmon.model.staying import STAYING_PART, Bits, Edges, Plane
+from gripmon.model.staying import Bits, Edges, Plane
 
 SHORTEST_OUTLINE_PX = 40.0
 """Shortest outline of a finger in view: 8 px across a tip and twice 16 px along it are the least that six parameters of
@@ -90,9 +90,9 @@ def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Se
     """
     strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
     if len(within) > 1:
-        each = [_candidates(_inside_box(still, box), strength)[:1] for box in within]
+        each = [_candidates(_inside_box(still, box), strength, edges.limit)[:1] for box in within]
         return _chosen([own for found in each for own in found], still, len(within))
-    found = _candidates(_inside_box(still, within[0]) if within else still, strength)
+    found = _candidates(_inside_box(still, within[0]) if within else still, strength, edges.limit)
     alike = [own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]]
     if count != 1 and len(alike) == 1 and len(found) > 1:  # the largest may be a cable
         raise UnclearPartsError(
@@ -111,12 +111,12 @@ def _inside_box(still: Bits, box: Box) -> Bits:
     return out
 
 
-def _candidates(still: Bits, strength: Plane) -> list[_Part]:
+def _candidates(still: Bits, strength: Plane, limit: float) -> list[_Part]:
     """Parts that may be fingers, those with the longest outline first."""
     found = [own for part in _connected(still) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
     shares = [_mean_along(own[0], still, strength) for own in found]
     longest = int(np.argmax([own[2] * share for own, share in zip(found, shares, strict=True)])) if found else 0
-    least = max(STAYING_PART, ALIKE_SHARES * shares[longest]) if found else 0.0
+    least = max(limit, ALIKE_SHARES * shares[longest]) if found else limit
     found = [own for own, share in zip(found, shares, strict=True) if share > least]
     if any(enters for *_, enters in found):  # what floats in the view is a mark on the lens, a stamp, a reflection
         found = [own for own in found if own[3]]

@@ -5,7 +5,7 @@ left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,15 +18,7 @@ from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsE
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
-from gripmon.teach.silhouette import (
-    Stations,
-    Transitions,
-    beside_contour,
-    evenly,
-    measure_transitions,
-    stations_along,
-    trace,
-)
+from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
 from gripmon.teach.straight_pieces import STRAIGHT_PX, Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
@@ -40,7 +32,6 @@ LEAST_SHARPNESS = 0.6
 LEAST_SEEN = 0.7
 """Least part of a finger's outline in view that is measured: with less, what is missing may be its tip."""
 _TURNS = 4
-_SMOOTH_PX = 1.5  # along an outline, by which search lines are square to it
 
 
 @dataclass(frozen=True)
@@ -84,20 +75,14 @@ def see_opening(
     matte = find_matte(images, least_noise, step)
     left_out = dict(matte.left_out)
     parts = find_fingers(matte.still, matte.edges, fingers, within)
-    near = _near(parts.rest)
     contours = [(part, contour) for part in parts.fingers for contour in trace(part, int(SHORTEST_OUTLINE_PX))]
-    if not contours:
-        raise NoResultError("nothing that stays has an outline; the gripper's fingertips in view")
     for turn in range(_TURNS):
-        along = [_settled(matte, contour, part, near) for part, contour in contours]
-        contours = [(own.part, own.stations.uv_px) for own in along]
-        blur_px = float(np.median([own.blur_px for own in along]))
-        if blur_px > MOST_BLUR_PX:
+        stations, found = _around(matte, contours, parts.rest)
+        if found.blur_px > MOST_BLUR_PX:
             raise NoResultError(
-                f"the outline is blurred by {blur_px:.1f} px in all images; at most {MOST_BLUR_PX:g} px: "
+                f"the outline is blurred by {found.blur_px:.1f} px in all images; at most {MOST_BLUR_PX:g} px: "
                 "fingertips in focus, no motion during exposure"
             )
-        stations, found = _around(matte, along, blur_px)
         bad = _blurred(found)
         if bad:
             left_out.update({matte.kept[k]: why for k, why in bad.items()})
@@ -113,34 +98,22 @@ def see_opening(
                 break
             matte = _moved_back(matte, moved, stations.uv_px[found.usable])
         step()
-    seen, borders = _fingers(camera, matte, along, parts, blur_px, step)
-    return OpeningSeen(matte, seen, left_out, blur_px, parts.rest, borders)
+    seen, borders = _fingers(camera, matte, contours, parts, found.blur_px, step)
+    return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest, borders)
 
 
-@dataclass(frozen=True)
-class _Along:
-    """Stations on the outline of a ``part`` (h, w), and where (s,) it is ``sure`` that they are; its ``blur_px``."""
-
-    part: Bits
-    stations: Stations
-    sure: Bits
-    blur_px: float
-
-
-def _settled(matte: Matte, contour: Array, part: Bits, near: Bits) -> _Along:
-    """Stations on the outline beside a contour (k, 2), which doesn't matter any more then."""
-    stations = _stations(contour, part, near)
-    off_px, *_ = beside_contour(matte.images, stations, matte.noise)
-    stations = _stations(evenly(stations.uv_px + off_px[:, None] * stations.normal, _SMOOTH_PX), part, near)
-    off_px, sure, blur_px = beside_contour(matte.images, stations, matte.noise)
-    return _Along(part, replace(stations, uv_px=stations.uv_px + off_px[:, None] * stations.normal), sure, blur_px)
-
-
-def _around(matte: Matte, along: Sequence[_Along], blur_px: float) -> tuple[Stations, Transitions]:
-    """All stations along the contours, and the transitions measured there."""
-    stations = Stations(*(np.concatenate([getattr(s.stations, f.name) for s in along]) for f in fields(Stations)))
-    found = measure_transitions(matte.images, stations, matte.noise, wide=False, blur_px=blur_px)
-    found = replace(found, usable=found.usable & np.concatenate([s.sure for s in along]))
+def _around(matte: Matte, contours: Sequence[tuple[Bits, Array]], rest: Bits) -> tuple[Stations, Transitions]:
+    """Stations along all contours, and the transitions measured there."""
+    if not contours:
+        raise NoResultError("nothing that stays has an outline; the gripper's fingertips in view")
+    near = _near(rest)
+    each = [_stations(contour, part, near) for part, contour in contours]
+    stations = Stations(
+        np.vstack([s.uv_px for s in each]),
+        np.vstack([s.normal for s in each]),
+        np.concatenate([s.inside for s in each]),
+    )
+    found = measure_transitions(matte.images, stations, matte.noise, wide=True)
     if np.count_nonzero(found.usable) < SHORTEST_OUTLINE_PX:
         raise NoResultError(
             f"the outline is visible along only {np.count_nonzero(found.usable)} px; at least "
@@ -245,7 +218,7 @@ def _length_px(chain: Chain) -> float:
 def _fingers(
     camera: Camera,
     matte: Matte,
-    along: Sequence[_Along],
+    contours: Sequence[tuple[Bits, Array]],
     parts: Parts,
     blur_px: float,
     step: Callable[[], None],
@@ -253,14 +226,14 @@ def _fingers(
     """The fingers with the chains of their outlines, and how much of each border that is."""
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
-    shown = []
-    for each in along:
-        part, stations = each.part, each.stations
-        found = measure_transitions(matte.images, stations, matte.noise, wide=False, blur_px=blur_px)
+    along, near = [], _near(parts.rest)
+    for part, contour in contours:
+        stations = _stations(contour, part, near)
+        found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
         points = stations.uv_px + found.offset_px[:, None] * stations.normal
         in_view[id(part)] += int(np.count_nonzero(stations.inside))
-        shown.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
-        for run, closed in runs(found.usable & each.sure, points):
+        along.append((next(k for k, own in enumerate(parts.fingers) if own is part), stations, found))
+        for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
                 camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
@@ -268,7 +241,7 @@ def _fingers(
         step()
     centres_px = [np.argwhere(part)[:, ::-1].mean(axis=0) for part in parts.fingers]
     own = [chains[id(part)] for part in parts.fingers]
-    borders = tuple(borders_of(_names(centres_px), parts.outwards, centres_px, shown, own, matte.mean.shape))
+    borders = tuple(borders_of(_names(centres_px), parts.outwards, centres_px, along, own, matte.mean.shape))
     worst = [border for border in borders if border.share < WELL_SEEN][:2] or borders[:1]
     shares = [sum(map(_length_px, chains[id(part)])) / max(in_view[id(part)], 1) for part in parts.fingers]
     if min(shares) < LEAST_SEEN:

@@ -14,7 +14,6 @@ delete-a-group jackknife), which includes correlated errors of neighbouring poin
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -59,15 +58,6 @@ _STEP_PX = 0.5
 _WIDE_PX, _NARROW_PX = 8.0, 5.0
 _GRID_PX = 0.125
 _SMOOTH_PX = 3.0
-_INDEPENDENT = 5.0
-"""Samples of a search line that are independent, of 12.5 px: a background's texture has blots of two or three."""
-_LEAST_MISFIT = 1e-4
-"""Least sum of squares of a transition about its fit, over the contrast's square: 0.2 % of it a sample."""
-_WAVERS_PX = 0.25
-"""How much an outline's distance from a contour changes from one station to the next, standard deviation: by 4 px, as
-far as it is looked for, over half a cell of 14 px that a mask is made of."""
-_WAY_STEP = 2  # of the grid: a quarter of a pixel
-_WRAP = 40  # stations: what is farther along a closed contour decides nothing
 
 
 @dataclass(frozen=True)
@@ -86,15 +76,16 @@ class Transitions:
     """What the images show across an outline.
 
     ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
-    out; ``usable`` (s,); ``shift_px`` (n, s), how much farther out an image shows the edge than all images do, with the
-    relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of each image's transitions over
-    that of all; ``clear`` and ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger,
-    grey.
+    out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
+    edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
+    each image's transitions over that of all; ``clear`` and
+    ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
     """
 
     offset_px: Array
     folds_px: Array
     usable: NDArray[np.bool_]
+    blur_px: float
     shift_px: Array
     worth: Array
     sharpness: Array
@@ -116,18 +107,13 @@ def trace(still: NDArray[np.bool_], smallest_px: int) -> list[Array]:
         points = contour[:, 0].astype(float)
         if len(points) < smallest_px:
             continue
-        out.append(evenly(points, _SMOOTH_PX))
+        smooth = gaussian_filter1d(points, _SMOOTH_PX, axis=0, mode="wrap")
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0, append=smooth[:1]), axis=1))])
+        count = int(way[-1])
+        around = np.vstack([smooth, smooth[:1]])
+        at = np.arange(count) * way[-1] / count
+        out.append(np.column_stack([np.interp(at, way, around[:, k]) for k in (0, 1)]))
     return out
-
-
-def evenly(points: Array, smooth_px: float) -> Array:
-    """A closed contour (k, 2) smoothed, with a point per pixel."""
-    smooth = gaussian_filter1d(points, smooth_px, axis=0, mode="wrap")
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0, append=smooth[:1]), axis=1))])
-    count = int(way[-1])
-    around = np.vstack([smooth, smooth[:1]])
-    at = np.arange(count) * way[-1] / count
-    return np.column_stack([np.interp(at, way, around[:, k]) for k in (0, 1)])
 
 
 def stations_along(contour: Array, still: NDArray[np.bool_]) -> Stations:
@@ -164,35 +150,12 @@ def lines_in_image(
     return np.asarray(in_image(uv_px, shape, FROM_BORDER_PX) & in_image(ends, shape, 1.0).all(axis=0))
 
 
-@dataclass(frozen=True)
-class _Across:
-    """What shows across stations at the distances ``s`` (samples,): ``d`` (n, stations, samples), how much brighter
-    than the finger; ``contrast`` (n, stations) of each image's background; ``upper`` (n, stations, samples) and
-    ``lower`` (n, stations), whose sums' quotient is the transition; ``near`` (samples,), where it is fitted, within
-    ``search_px``; ``usable``, ``clear``, ``different`` and ``level`` as in :class:`Transitions`.
+def measure_transitions(
+    images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float | None = None
+) -> Transitions:
+    """The edge's position at each station in ``images`` (n, h, w); ``wide`` searches within 4 px, otherwise within 2 px
+    and more exactly.  ``blur_px`` is estimated if None.
     """
-
-    s: Array
-    d: Array
-    contrast: Array
-    upper: Array
-    lower: Array
-    near: NDArray[np.bool_]
-    search_px: float
-    usable: NDArray[np.bool_]
-    clear: NDArray[np.intp]
-    different: NDArray[np.intp]
-    level: Array
-
-    def transition(self, left_out: NDArray[np.bool_] | None = None) -> Array:
-        """The transition (stations, near samples), without images (n,) that are left out."""
-        upper, lower = self.upper.sum(axis=0), self.lower.sum(axis=0)
-        if left_out is not None:
-            upper, lower = upper - self.upper[left_out].sum(axis=0), lower - self.lower[left_out].sum(axis=0)
-        return np.asarray((upper / np.maximum(lower, 1e-6)[:, None])[:, self.near])
-
-
-def _across(images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool) -> _Across:
     reach = _WIDE_PX if wide else _NARROW_PX
     search = 4.0 if wide else 2.0
     s = np.arange(-reach, reach + 0.25, _STEP_PX)
@@ -211,76 +174,29 @@ def _across(images: NDArray[np.float32], stations: Stations, noise: float, *, wi
     sound = (np.abs(off - light) < 4.0 * max(noise, 1.0)) & (np.abs(light) < MOST_RELIGHT * usual)
     contrast = np.where(sound, d[:, :, beyond].mean(axis=2), 0.0)
     # Beyond a few times the usual contrast more doesn't help: errors then grow with the contrast.
-    error = np.maximum(1.0, np.abs(contrast) / 60.0)
-    if wide:  # by the images' differences alone: what they have in common may be the finger's own shading
-        weight = (contrast - np.average(contrast, axis=0, weights=1.0 / error)) / error
-    else:
-        weight = contrast / error
-        weight = weight - _shading(finger[:, s <= -search], d, contrast, s, search) * weight.mean(axis=0)
+    weight = contrast / np.maximum(1.0, np.abs(contrast) / 60.0)
+    shading = 1.0 if wide else _shading(finger[:, s <= -search], d, contrast, s, search)
+    weight = weight - shading * weight.mean(axis=0)
+    upper, lower = weight[:, :, None] * d, weight * contrast
+    total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
     clear, different = backgrounds_beside(contrast, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
+    transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
-    upper, lower = weight[:, :, None] * d, weight * contrast
-    return _Across(s, d, contrast, upper, lower, near, search, usable, clear, different, usual)
-
-
-def measure_transitions(
-    images: NDArray[np.float32], stations: Stations, noise: float, *, wide: bool, blur_px: float
-) -> Transitions:
-    """The edge's position at each station in ``images`` (n, h, w), blurred by ``blur_px``; ``wide`` searches within 4
-    px, otherwise within 2 px and more exactly.
-    """
-    seen = _across(images, stations, noise, wide=wide)
-    s, search = seen.s[seen.near], seen.search_px
-    transition = seen.transition()
-    offset, fits = _edge(transition, s, blur_px, search)
-    usable = seen.usable & fits
+    if blur_px is None:
+        blur_px = _usual_blur(transition[usable][:, near], s[near], search)
+    offset, fits = _edge(transition[:, near], s[near], blur_px, search)
+    usable &= fits
     fold = folds_of(len(images))
-    without = [seen.transition(fold == f) for f in range(int(fold.max()) + 1)]
-    folds = _edge(np.concatenate(without), s, blur_px, search)[0].reshape(len(without), -1)
-    shift, worth, sharpness = _of_each(seen.d, seen.contrast, seen.s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, shift, worth, sharpness, seen.clear, seen.different, seen.level)
-
-
-def beside_contour(
-    images: NDArray[np.float32], stations: Stations, noise: float
-) -> tuple[Array, NDArray[np.bool_], float]:
-    """How far (s,) the outline lies beside stations along a closed contour, at most 4 px; where (s,) that is sure; and
-    the usual blur of its transition, px.
-
-    Of all ways along the contour at once the most likely, smooth one along which the background begins (dynamic
-    programming; Amini, Weymouth and Jain 1990): single stations before texture are off by pixels.  It is sure where any
-    way a pixel or more beside it is less than :data:`NOT_SURE` as likely.
-    """
-    seen = _across(images, stations, noise, wide=True)
-    s, transition = seen.s[seen.near], seen.transition()
-    blur_px = _usual_blur(transition[seen.usable], s, seen.search_px)
-    grid, misfit = _misfit(transition, s, blur_px, seen.search_px)
-    grid, misfit = grid[::_WAY_STEP], misfit[::_WAY_STEP].T
-    # The scatter is another one at each station: its likelihood's maximum.
-    cost = 0.5 * _INDEPENDENT * np.log(np.maximum(misfit, _LEAST_MISFIT))
-    total = _with_the_rest(np.where(seen.usable[:, None], cost, 0.0), grid)
-    at = total.argmin(axis=1)
-    beside = np.abs(grid - grid[at][:, None]) >= WITHIN_PX
-    second = np.where(beside, total, np.inf).min(axis=1) - total.min(axis=1)
-    return grid[at], seen.usable & (second > -math.log(NOT_SURE)), blur_px
-
-
-def _with_the_rest(cost: Array, grid: Array) -> Array:
-    """Cost (s, g) of the best closed way through each place, from the stations' own costs (s, g) at the distances
-    ``grid`` (g,) and what it costs to get from one to the next.
-    """
-    count = len(cost)
-    around = cost[np.arange(-_WRAP, count + _WRAP) % count]
-    bend = 0.5 * np.square(np.subtract.outer(grid, grid) / _WAVERS_PX)
-    ways = []
-    for order in (around, around[::-1]):
-        best = np.zeros_like(order)
-        for k in range(1, len(order)):
-            best[k] = (best[k - 1] + order[k - 1] + bend).min(axis=1)
-        ways.append(best)
-    return np.asarray((around + ways[0] + ways[1][::-1])[_WRAP : _WRAP + count])
+    without = []
+    for f in range(int(fold.max()) + 1):
+        part = fold == f
+        rest = np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)
+        without.append(((total_upper - upper[part].sum(axis=0)) / rest[:, None])[:, near])
+    folds = _edge(np.concatenate(without), s[near], blur_px, search)[0].reshape(len(without), -1)
+    shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
 def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:

@@ -43,7 +43,7 @@ def seen_opening(
     shape = camera.height_px, camera.width_px
     found = tuple(_finger(camera, shape, f @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3], noise_px, rng) for f in fingers)
     nothing = np.zeros(shape, np.float32)
-    edges = Edges(nothing, nothing, nothing > 0, nothing)
+    edges = Edges(nothing, nothing, nothing > 0, nothing > 0, 0.1)
     matte = Matte(nothing > 0, edges, 1.0, nothing[None], np.zeros((1, 2)), (0,), {})
     return OpeningSeen(matte, found, {}, 1.0, nothing > 0)
 
