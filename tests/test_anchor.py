@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.monitor.anchor import CONFIRMING_FRAMES, Anchor, Lasting, average_of
+from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
 from gripmon.monitor.bounds import ModelError
 from gripmon.track.integrity import hypotheses_of
 
@@ -244,6 +244,18 @@ def test_what_the_model_is_wrong_by_does_not_average_out():
     for number, frame in enumerate(right):
         newer.add(frame, ROWS, STILL, 0.1 * number, SURE)
     assert np.abs(newer.of_model).max() < 0.1 * np.abs(frames[0].of_model).max()
+
+
+def test_an_image_without_a_fit_counts_nothing_in_the_average_of_images():
+    """Also where the others leave a direction open: it had cost the digits of what they see."""
+    frames, play = stream(np.random.default_rng(3), 3, 0.0), 0.3 * SIGMA
+    without = ROWS.copy()
+    without[-1] = NO_FIT
+    average = average_of(BASE_T, [(frames[0], without), *((frame, ROWS) for frame in frames[1:])], play)
+    of_others = average_of(BASE_T, [(frame, ROWS) for frame in frames[1:]], play)
+    np.testing.assert_allclose(average.shift[-1], of_others.shift[-1], rtol=1e-9)
+    np.testing.assert_allclose(average.covariance[-1], of_others.covariance[-1], rtol=1e-9)
+    assert np.linalg.eigvalsh(average.covariance).min() > 0.0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 12])

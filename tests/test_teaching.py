@@ -240,7 +240,8 @@ def test_the_play_of_each_image_is_found_where_the_renderer_had_it():
     images = [TeachingImage(image, OPENING_M, f"{n}.png") for n, image in enumerate(with_some_play(BEVEL_M))]
     viewer = Viewer(RIG, reference(None, 1e-3, 1e-2), images)
     found, spread = with_play(viewer, [viewer.view(image, viewer.fitted(image)) for image in images])
-    np.testing.assert_allclose(spread, PLAY.std(axis=0, ddof=1), rtol=0.1)
+    # Of five images: what one more deviates by, when its spread is known from these (Student).
+    np.testing.assert_allclose(spread, PLAY.std(axis=0, ddof=1) * np.sqrt(4.0 / 2.0), rtol=0.1)
     corners_m = box_gripper().points_grip_m(OPENING_M)[box_gripper().corner_points]
     for image, truth in zip(found, PLAY, strict=True):
         seen, true = (

@@ -207,9 +207,13 @@ def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]],
     stood at places that scatter by standard deviations ``play`` (6,), of which the average is off by what they are few.
     As in the anchor, errors that don't scatter don't average out; unlike there, the newest frames don't weigh more.
     """
-    each, count, places = [_chosen(fits, rows, base_T) for fits, rows in frames], len(frames), np.diag(np.square(play))
+    each, places = [_chosen(fits, rows, base_T) for fits, rows in frames], np.diag(np.square(play))
+    unknown = np.stack([rows == NO_FIT for _, rows in frames])
+    unknown &= ~unknown.all(axis=0)  # where no frame has a fit, they are as unknown together
+    count = np.count_nonzero(~unknown, axis=0)[:, None]
     own = np.stack([fits.covariance for fits in each])
     information = np.linalg.inv(own + places)
+    information[unknown] = 0.0
     weight = np.linalg.inv(information.sum(axis=0)) @ information
     shift = np.stack([fits.shift for fits in each])
     mean = np.einsum("nhij,nhj->hi", weight, shift)
@@ -220,10 +224,10 @@ def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]],
     # Of errors that are smaller than the play, a scatter by that says nothing.
     scatter = (variance / both * np.minimum(np.square(shift - mean) / both, MOST_SCATTER)).sum(axis=0)
     # Of a frame as the average has them: the surer ones weigh more.
-    usual = 1.0 / (1.0 / variance).mean(axis=0)
+    usual = count / np.where(unknown[:, :, None], 0.0, 1.0 / variance).sum(axis=0)
     young = np.clip(np.einsum("hii->hi", covariance) / usual, 1.0 / count, 1.0)
-    claimed = _claimed(covariance, young, scatter / (count - 1 + PRIOR_FRAMES)) + places / count
-    return Separation(mean, claimed, of_model)
+    claimed = _claimed(covariance, young, scatter / (count - 1 + PRIOR_FRAMES)) + places / count[:, :, None]
+    return Separation(mean, 0.5 * (claimed + claimed.transpose(0, 2, 1)), of_model)
 
 
 def _claimed(covariance: Array, young: Array, scatter: Array) -> Array:

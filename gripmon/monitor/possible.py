@@ -91,13 +91,12 @@ def seen_in_images(
     taught_ns: int,
 ) -> AtReferenceRecord | None:
     """What a monitor with taught edges measures of the images that they were taught from, ``taught_ns`` (Unix ns) when,
-    on average; ``play`` (6,): standard deviations of the mount's play between them.  Where no image proves where the
-    gripper is, by its fits without the fingers' ends.  None where it is seen in none.
+    on average of those that prove where the gripper is, else of all by their fits without the fingers' ends; ``play``
+    (6,): standard deviations of the mount's play between them.  None where it is seen in none.
     """
     cam_T_grip = from_record(reference.cam_T_grip)
     possible, risk = Possible(tracker, gripper, settings, cam_T_grip), settings.policy.integrity_risk
-    evidence, fits, openings_m = EndsEvidence(gripper, tracker.along), list[tuple[Refits, About]](), list[float]()
-    misread, proven = 1.0, False
+    evidence, fits = EndsEvidence(gripper, tracker.along), list[tuple[Refits, About, float, float, bool]]()
     for number, frame in enumerate(frames):
         measurement = tracker.measure(frame, cam_T_grip, float(number))
         if not measurement.trusted:
@@ -106,20 +105,21 @@ def seen_in_images(
         ends, about = tracker.ends(frame, measurement), possible.about(measurement.normal.edge)
         known = _nothing_known(measurement.cam_T_grip)
         floor = tracker.floor_of(measurement)
-        fits.append((Refits(measurement, about.hypotheses, floor, possible.model, known), about))
-        openings_m.append(measurement.jaw_opening_m)
-        own = evidence.misread(measurement, ends)
-        strictly = own * MISREAD_PROBABILITY ** strict_fingers(ends)
-        if proves(ends, elsewhere=False, again=True) or (ends.at_each and within(strictly, risk)):
-            own, proven = strictly, True
-        misread = min(misread, own)
+        misread = evidence.misread(measurement, ends)
+        strictly = misread * MISREAD_PROBABILITY ** strict_fingers(ends)
+        proven = proves(ends, elsewhere=False, again=True) or (ends.at_each and within(strictly, risk))
+        own = Refits(measurement, about.hypotheses, floor, possible.model, known)
+        fits.append((own, about, measurement.jaw_opening_m, strictly if proven else misread, proven))
     if not fits:
         return None
-    of_each = [(own if proven else own.under(about.without_ends), about.rows) for own, about in fits]
+    proven = any(each[-1] for each in fits)
+    counting = [each for each in fits if each[-1] == proven]
+    of_each = [(own if proven else own.under(about.without_ends), about.rows) for own, about, *_ in counting]
+    openings_m, misread = [each[2] for each in counting], min(each[3] for each in counting)
     average = average_of(cam_T_grip, of_each, play)
     seen_T = perturb(cam_T_grip, average.shift[0])
     of = average._replace(shift=average.shift - average.shift[0])
-    at = seen_T, of, float(np.mean(openings_m)), len(fits), Since.REFERENCE, taught_ns, misread, proven
+    at = seen_T, of, float(np.mean(openings_m)), len(counting), Since.REFERENCE, taught_ns, misread, proven
     return AtReference(*at, of_images=True).record(reference.reference_id, digest_of(tracker.measured_as))
 
 

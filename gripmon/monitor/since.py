@@ -202,7 +202,9 @@ class AtReference(NamedTuple):
         which a mount that vibrates differs from its average.
         """
         lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
-        more, travel, by_motion = np.diag(swing) * (not self.of_images), np.zeros(6), np.zeros((0, 6, 3))
+        # Each image was at another place of what swings.
+        more, travel = np.diag(swing) / (self.frames if self.of_images else 1), np.zeros(6)
+        by_motion = np.zeros((0, 6, 3))
         if common is not None:
             travel_m = opened.jaw_opening_m - self.jaw_opening_m
             more = common.of_motion(motion, self.cam_T_grip) + more
@@ -238,13 +240,20 @@ class AtReferences:
         """Grows with each change that a restart should know."""
         self.now_ns = 0
         """Stamp of the newest frame."""
+        self.first_ns: int | None = None
+        """Stamp of the run's first frame."""
         self.refer(reference)
 
     @property
     def elapsed_s(self) -> float:
-        """Time since the reference's frames; of a clock that was set back none."""
+        """Time since the reference's frames; of a clock that was set back none.  Of images to teach from at least that
+        since the run's first frame: recorded frames may be older than these.
+        """
         first = self.current
-        return 0.0 if first is None else max(1e-9 * (self.now_ns - first.since_ns), 0.0)
+        if first is None:
+            return 0.0
+        began_ns = self.first_ns if first.of_images and self.first_ns is not None else first.since_ns
+        return 1e-9 * max(self.now_ns - first.since_ns, self.now_ns - began_ns, 0)
 
     @property
     def published_by(self) -> tuple[AtReference | None, Array]:
@@ -368,7 +377,11 @@ class AtReferences:
             )
         for each in records:
             at = AtReference.of_record(each, lasting, fingers) if each.measured_as == self._digest else None
-            if at is not None:
+            taught = self._known.get(each.reference_id)
+            if at is not None and taught is not None and taught.of_images and taught.proven and not at.of_images:
+                # Taught again since, to the same edges: of what the run saw only whether the mount was knocked counts.
+                self._known[each.reference_id] = taught._replace(knocked=at.knocked)
+            elif at is not None:
                 self._known[each.reference_id] = at
             elif each.reference_id not in self._known:
                 refused = (

@@ -30,6 +30,11 @@ from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRef
 PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
 
+TAUGHT_OTHERWISE = (
+    "where the teaching images had the gripper isn't used: they were measured with other settings; the motion since "
+    "the reference counts from the next 30 frames that prove where it is, or teach again"
+)
+
 
 class _Candidate(NamedTuple):
     """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), the fingers' slide from
@@ -59,14 +64,17 @@ class Integrity:
         self.since = AtReferences(reference, policy.valid_by, policy.integrity_risk, tracker.measured_as)
         """What was measured at the reference in force."""
         self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
+        unused = tracker.taught_at[0] is not None and self.since.current is None
+        self.since_refused: str | None = TAUGHT_OTHERWISE if unused else None
+        """Why what the taught edges or a state have about the reference's frames isn't used; None where it is, or there
+        is nothing.
+        """
         # Fingers without a direction of their own are slid out of the gripper.
         axis = tracker.finger_axis if tracker.finger_axis.any() else np.array([0.0, 0.0, 1.0])
         self._look = GripperLook(camera, gripper, axis)
         self._strips = FingerStrips(camera, gripper, tracker.along)
         self.strips_refused: str | None = None
         """Why strips that were kept over a restart aren't used; None where they are, or none were kept."""
-        self.since_refused: str | None = None
-        """Why what a state has about the reference's frames isn't used; None where it is, or there is nothing."""
         self._learn_from: tuple[Image, Array, float, float] | None = None
         self._jaw_opening_m = 0.0  # in the newest frame that proved a pose
         self._frames = 0
@@ -125,7 +133,7 @@ class Integrity:
                 self.strips_refused = str(refused)
         if state is not None:
             known = () if state.at_reference is msgspec.UNSET else state.at_reference
-            self.since_refused = self._weigher.restore(known)
+            self.since_refused = self._weigher.restore(known) or self.since_refused
 
     def learn(self) -> None:
         """Learn the look from the newest frame that proved the pose, once."""
@@ -155,6 +163,8 @@ class Integrity:
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
         """What to publish of a measurement, and how far it is trusted; None where the gripper isn't seen."""
         self.since.now_ns = frame.stamp_ns
+        if self.since.first_ns is None:
+            self.since.first_ns = frame.stamp_ns
         if measurement.trusted:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)

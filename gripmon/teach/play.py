@@ -74,8 +74,10 @@ def with_play(viewer: Viewer, views: Sequence[View]) -> tuple[list[TeachingImage
     own, unsure = play[enough], unsure[enough]
     if not unsure.any():
         return images, np.zeros(6)
-    # The play that the images have, as far as each shows its own, and the variance of what it doesn't show of it.
-    spread = np.square(own - own.mean(axis=0)).sum(axis=0) / max(len(own) - 1, 1)
+    # The play that the images have, as far as each shows its own, and the variance of what it doesn't show of it.  A
+    # spread that few images show is known as badly: its variance is Student's, and of three or fewer that has none.
+    squares, free = np.square(own - own.mean(axis=0)).sum(axis=0), len(own) - 1
+    spread = squares / (free - 2) if free > 2 else np.maximum(squares, 1.0 / prior.diagonal())
     return images, np.sqrt(spread + unsure.mean(axis=0))
 
 
