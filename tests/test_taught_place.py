@@ -105,6 +105,19 @@ WAYS = {
 }
 
 
+@pytest.mark.parametrize("changed", ["knocked before the start", "taught with longer tips"])
+def test_what_may_be_the_mount_or_the_gripper_since_the_images_is_in_the_bound(changed: str):
+    """Worn tips, another lamp or another focus than on the day of the teaching look like a motion."""
+    along_m = 1.5e-3 * AXIS
+    run = Watched(with_play(), np.tile(along_m, (40, 1)))
+    true_m = along_m if changed == "knocked before the start" else np.zeros(3)
+    errors_m = np.linalg.norm(run.motions_m - true_m, axis=1)
+    assert (errors_m <= run.bounds[:, 0]).all() and run.valid == 0.0
+    # The operator who says that it was the mount ends it, with a new reference of this run's own frames.
+    (kept,) = run.monitor.state().at_reference
+    assert np.linalg.norm(np.array(kept.away[:3]) - along_m) < 5e-5
+
+
 @pytest.mark.parametrize("name", WAYS)
 def test_no_frame_is_beyond_its_bound_and_what_moved_is_in_the_motion(name: str):
     run = Watched(with_play(), WAYS[name])
@@ -148,7 +161,7 @@ def test_a_state_of_the_first_frames_does_not_replace_images_taught_since():
     earlier = msgspec.structs.replace(kept, of_images=False, since=Since.FIRST_PROVED, knocked=True)
     state = msgspec.structs.replace(run.monitor.state(), at_reference=(earlier,))
     (now,) = Monitor(CAMERA, box_gripper(), SETTINGS, REFERENCE, with_play(), state).state().at_reference
-    assert now == msgspec.structs.replace(kept, knocked=True)
+    assert now == msgspec.structs.replace(kept, knocked=True, away=())
 
 
 def test_of_images_newer_than_the_frames_the_time_counts_from_the_first_frame():

@@ -143,7 +143,8 @@ class AtReference(NamedTuple):
     ``cam_T_grip`` (4, 4), which is exp(b) reference; the opening, and the number of ``frames`` that were averaged.
     ``misread``: probability that what looked like the fingers' ends in all of these was something else; ``proven``:
     whether one of them proved the pose; ``knocked``: whether the mount was, later on.  ``of_images``: they are images
-    to teach from, each at another place of the mount's play: it is their average that a motion counts from.
+    to teach from, each at another place of the mount's play: it is their average that a motion counts from.  ``away``
+    (6,): from there to where the first frames that proved a pose had the gripper; None before.
     """
 
     cam_T_grip: Array
@@ -156,6 +157,7 @@ class AtReference(NamedTuple):
     proven: bool
     knocked: bool = False
     of_images: bool = False
+    away: Array | None = None
 
     @classmethod
     def of_record(cls, record: AtReferenceRecord, lasting: int, fingers: int) -> AtReference | None:
@@ -164,7 +166,8 @@ class AtReference(NamedTuple):
         if fits is None:
             return None
         at = from_record(record.cam_T_grip), fits, record.jaw_opening_m, record.frames, record.since, record.since_ns
-        return cls(*at, record.misread, record.proven, record.knocked, record.of_images)
+        away = np.array(record.away) if len(record.away) == 6 else None
+        return cls(*at, record.misread, record.proven, record.knocked, record.of_images, away)
 
     def record(self, reference_id: str, measured_as: str) -> AtReferenceRecord:
         """To be kept."""
@@ -184,7 +187,20 @@ class AtReference(NamedTuple):
             self.proven,
             self.knocked,
             self.of_images,
+            () if self.away is None else tuple(self.away.tolist()),
         )
+
+    def looks_away(self, cam_T_grip: Array) -> Array | None:
+        """(6,) by how much what is measured may be off since the images to teach from, m and rad; None without these.
+
+        An error that is the same in these and now cancels: between another day's images and this one's a lamp, the
+        focus, a pad or the camera may have been changed, and tips worn, which looks like a motion.  Where this run's
+        first frames have the gripper elsewhere than the images, nothing tells such a change from a knock in between:
+        ``cam_T_grip`` (4, 4) until one of them has proved a pose.
+        """
+        if not self.of_images:
+            return None
+        return perturbation_between(self.cam_T_grip, cam_T_grip) if self.away is None else self.away
 
     def motion(self, cam_T_grip: Array) -> Array:
         """exp(d) (4, 4) of a measured pose (4, 4)."""
@@ -234,6 +250,7 @@ class AtReferences:
         self.current: AtReference | None = None
         """At the reference in force; None until a frame proves a pose."""
         self._growing: Average | None = None  # the average that b follows until there are enough frames
+        self._compared: Average | None = None  # the one that is compared with images to teach from as long
         self._risk = risk
         self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
         self.changes = 0
@@ -291,7 +308,7 @@ class AtReferences:
         """Another reference is in force; one that is restored is still known."""
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
-        self._growing, self.current = None, self._known.get(self._id)
+        self._growing, self._compared, self.current = None, None, self._known.get(self._id)
         self._unproved_T = None
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
@@ -303,6 +320,8 @@ class AtReferences:
         """A frame counts, which ``anchor`` includes: it has proved a pose, or none has yet."""
         growing = self._growing
         if growing is None and self.current is not None:
+            if self.current.of_images and anchor.proven:
+                self._compare(self.current, anchor)
             return
         if growing is not None and growing is not anchor and not self._was_wrong(growing, anchor):
             self._end()  # the mount was knocked
@@ -338,6 +357,19 @@ class AtReferences:
         bound, away = first.bound(self._risk), perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
         within = np.linalg.norm(away[:3]) <= bound.position_m and np.linalg.norm(away[3:]) <= bound.rotation_rad
         return first.frames <= UNSETTLED_FRAMES and bool(within)
+
+    def _compare(self, first: AtReference, anchor: Average) -> None:
+        """Where this run's first frames have the gripper, beside where images to teach from had it."""
+        before = self._compared
+        if before is None and first.away is not None:
+            return
+        if before is not None and before is not anchor and not self._was_wrong(before, anchor):
+            self._compared, self.changes = None, self.changes + 1  # the mount was knocked
+            return
+        away = perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
+        self._known[self._id] = self.current = first._replace(away=away)
+        enough = anchor.frames >= FIRST_FRAMES
+        self._compared, self.changes = None if enough else anchor, self.changes + enough
 
     def _end(self) -> None:
         self._growing = None

@@ -43,6 +43,8 @@ JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
 exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
+LOOKS_OTHERWISE = "the gripper isn't where the images had it that it was taught from: the mount, the light, or the tips"
+
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
@@ -237,13 +239,19 @@ class Weigher:
         return replace(trust, bounds=both, ambiguous=ambiguous, grasped=grasped, most_probable=most_probable)
 
     def _with_questions(self, both: Bounds, cam_T_grip: Array, displaced: bool) -> Bounds:
-        """The bounds while it is open why the first frames differ from the reference: no motion since them."""
-        absolute = both.absolute
+        """The bounds while it is open why the first frames differ from the reference: no motion since them, but of what
+        differs from images to teach from.
+        """
+        first, (absolute, since) = self._since.current, both
+        away = None if first is None else first.looks_away(cam_T_grip)
+        if away is not None:
+            why = LOOKS_OTHERWISE if np.linalg.norm(away[:3]) > since.position_m else since.hypothesis
+            since = reaching(since, away, why)
         if self.anchor is None and displaced:
             absolute = larger(absolute, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
         if self.unexplained is not None:
             absolute = larger(absolute, self._not_as_expected(self.unexplained))
-        return both._replace(absolute=absolute)
+        return Bounds(absolute, since)
 
     def _bounds(
         self,

@@ -94,6 +94,10 @@ class AtReferenceRecord(msgspec.Struct, frozen=True):
     of_images: Annotated[
         bool, Meta(description="whether these were images to teach from, each at another place of the mount's play")
     ] = False
+    away: Annotated[
+        tuple[float, ...],
+        Meta(description="(6,): from there to where the first frames that proved it had it, m and rad; of images"),
+    ] = ()
 
 
 class MonitorState(msgspec.Struct, frozen=True):
