@@ -21,7 +21,7 @@ from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.fingers import UnclearPartsError
-from gripmon.teach.from_images import GripperFromImages, gripper_from_images
+from gripmon.teach.from_images import GripperFromImages, _groups, gripper_from_images
 from gripmon.teach.matte import grey_levels, image_sets
 
 DISTANCE = (0.115, 5e-5)
@@ -197,3 +197,20 @@ def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:
     with pytest.raises(NoResultError, match=r"sets of 12 and 11.*the camera moved") as caught:
         made_of(images, PAPER_LENS, distance_m=DISTANCE)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("counts", "first"),
+    [
+        ({0.022: 8, 0.036: 8, 0.05: 8}, 0.05),
+        ({0.022: 12, 0.036: 8, 0.05: 6}, 0.05),
+        ({0.022: 20, 0.036: 10, 0.05: 9}, 0.036),  # of too few images an outline is known worse
+        ({0.022: 7, 0.05: 4}, 0.022),
+    ],
+)
+def test_what_is_seen_begins_with_the_widest_opening_that_has_images_enough(
+    counts: dict[float, int], first: float
+) -> None:
+    """Where fingers touch or overlap, less shows of them."""
+    groups = _groups([opening for opening, count in counts.items() for _ in range(count)], ())
+    assert next(iter(groups)) == first and {m: len(own) for m, own in groups.items()} == counts

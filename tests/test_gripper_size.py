@@ -100,3 +100,17 @@ def test_of_tapered_jaws_one_of_which_stands_nothing_is_claimed() -> None:
     shown = {m: fingers(TAPERED, m - OPEN_M, right=1.0) for m in (OPEN_M, CLOSED_M)}
     found, why = size(pose(), shown, 0)
     assert found is None and why
+
+
+@pytest.mark.parametrize("cam_T_grip", [pose(), pose(20.0), pose(45.0, 6.0, 4.0)])
+@pytest.mark.parametrize("shape", [TAPERED, ((0.006, 0.012), (0.024, 0.012), 0.09)])
+def test_a_tapered_side_is_no_part_of_the_tip(shape: Shape, cam_T_grip: Array) -> None:
+    """It doesn't run along the finger, whose direction a calibration tells; a box's sides do."""
+    given = cam_T_grip[:3, :3], cam_T_grip[:3, 3] / cam_T_grip[2, 3]
+    for own, flat in ((shape, True), (BOX, False)):
+        seen = seen_opening(CAMERA, cam_T_grip, fingers(own, 0.0), 0.02, np.random.default_rng(0))
+        placed = place(finger_outlines(CAMERA, seen), *given)
+        for points in placed.points:
+            local_m = cam_T_grip[2, 3] * (points - placed.tcp) @ placed.rotation
+            assert np.nanmax(np.ptp(local_m[np.isfinite(local_m).all(axis=1)], axis=0)[:2]) < own[1][0] + 0.008
+        assert placed.flat or not flat

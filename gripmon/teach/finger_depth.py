@@ -4,8 +4,8 @@ Long edges along a finger are parallel in space, so their images meet in one poi
 fingers' direction (Caprile and Torre 1990).  Fingertips end square to it: their outline lies in the contact plane, and
 the long edges run back from it.  The outline of a round tip lies in the plane of the finger's sides instead: it leaves
 them smoothly, whereas an outline in the contact plane would bend by 90 degrees, which is invisible from only a few
-places.  Where edges don't meet in a point, the outline is taken as flat, tilted as fingers before a wrist camera
-usually are.
+places.  Where edges don't meet in a point, or give a finger that is hardly longer than its tip, the outline is taken as
+flat, tilted as fingers before a wrist camera usually are.
 """
 
 from __future__ import annotations
@@ -81,6 +81,8 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         for finger, (tip, sides), turn in zip(fingers, runs, turns, strict=True)
     ]
     tips = [sorted(tip) for tip, _ in runs]
+    if not all(_longer_than_tip(p, tip, direction) for p, tip in zip(points, tips, strict=True)):
+        return _flat(fingers, centre, rotation, tcp)
     if rotation is None or tcp is None:
         inner = innermost([p[t] for p, t in zip(points, tips, strict=True)])
         # Between the fingers, at their ends: the innermost parts of round tips lie farther back.
@@ -166,6 +168,15 @@ def _in_space(
         out[end] = nearest_on_ray(sight_of(finger.xy[end]), out[start], direction)
     out[out[:, 2] <= 0.0] = np.nan
     return out
+
+
+def _longer_than_tip(points: Array, tip: Sequence[int], direction: Array) -> bool:
+    """Whether a finger, its vertices (v, 3), is seen back from its tip by twice the side of a square as large as that.
+    A side that tapers doesn't run along the finger: in the contact plane it makes a tip about as large as that is long.
+    """
+    back = points @ direction
+    large = float(np.linalg.norm(np.ptp(points[tip], axis=0)))
+    return bool(math.sqrt(2.0) * large < np.nanmax(back) - np.nanmin(back))
 
 
 def _smooth_turns(finger: Outline, tip: set[int], sides: Sequence[tuple[int, int]]) -> list[int]:

@@ -254,8 +254,9 @@ def _check_range(jaw_range_m: tuple[float, float] | None, openings_m: Sequence[f
 
 
 def _groups(openings_m: Sequence[float | None] | None, grey: Iterable[NDArray[np.float32]]) -> dict[float, list[int]]:
-    """Indices of the images of each opening, the one with most images first.  Unknown openings are numbered; for them
-    alone the images are looked at.
+    """Indices of the images of each opening: first the widest of those with at least half as many images as any, since
+    fingers that are apart hide nothing of each other; then the one with most.  Unknown openings are numbered, the one
+    with most images first; for them alone the images are looked at.
     """
     if openings_m is None:
         return {float(k): own for k, own in enumerate(image_sets(list(grey)))}
@@ -274,6 +275,9 @@ def _groups(openings_m: Sequence[float | None] | None, grey: Iterable[NDArray[np
             "the jaws at rest",
             "openings_m",
         )
+    least = max(FEWEST_IMAGES, 0.5 * len(runs[0]))
+    widest = max((run for run in runs if len(run) >= least), key=lambda run: openings_m[run[0]] or 0.0)
+    runs = [widest, *(run for run in runs if run is not widest)]
     return {round(float(np.mean([openings_m[k] or 0.0 for k in run])), 6): sorted(run) for run in runs}
 
 
@@ -300,10 +304,10 @@ def _assumptions(placed: PlacedOutlines, calibrated: bool, left_out: Mapping[str
     notes = []
     if placed.assumed:
         notes.append(
-            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: no three "
-            "long edges of the fingers meet in one point. The tilt's standard deviation of 15 degrees is in the bounds "
-            "of motions and of the absolute rotation (tilt_sigma_rad in the gripper file), by which no transform is "
-            "valid then: configure monitor.policy.valid_by: reference"
+            "the outline is assumed flat, and the fingers to point away at 35 degrees from the line of sight: their "
+            "long edges aren't parallel, or not enough of them show. The tilt's standard deviation of 15 degrees is in "
+            "the bounds of motions and of the absolute rotation (tilt_sigma_rad in the gripper file), by which no "
+            "transform is valid then: configure monitor.policy.valid_by: reference"
         )
     elif placed.flat:
         notes.append("the outline is assumed to lie in the reference's plane of x and z: its own edges show no other")
