@@ -91,8 +91,8 @@ def seen_in_images(
     taught_ns: int,
 ) -> AtReferenceRecord | None:
     """What a monitor with taught edges measures of the images that they were taught from, ``taught_ns`` (Unix ns) when,
-    on average of those that prove where the gripper is, else of all by their fits without the fingers' ends; ``play``
-    (6,): standard deviations of the mount's play between them.  None where it is seen in none.
+    on average, of those that don't prove where the gripper is by their fits without the fingers' ends; ``play`` (6,):
+    standard deviations of the mount's play between them.  None where it is seen in none.
     """
     cam_T_grip = from_record(reference.cam_T_grip)
     possible, risk = Possible(tracker, gripper, settings, cam_T_grip), settings.policy.integrity_risk
@@ -112,14 +112,14 @@ def seen_in_images(
         fits.append((own, about, measurement.jaw_opening_m, strictly if proven else misread, proven))
     if not fits:
         return None
-    proven = any(each[-1] for each in fits)
-    counting = [each for each in fits if each[-1] == proven]
-    of_each = [(own if proven else own.under(about.without_ends), about.rows) for own, about, *_ in counting]
-    openings_m, misread = [each[2] for each in counting], min(each[3] for each in counting)
+    of_each = [(own if proves_it else own.under(about.without_ends), about.rows) for own, about, *_, proves_it in fits]
     average = average_of(cam_T_grip, of_each, play)
+    proven = any(each[-1] for each in fits)
+    misread = min(each[3] for each in fits if each[-1] == proven)
+    openings_m = [each[2] for each in fits]
     seen_T = perturb(cam_T_grip, average.shift[0])
     of = average._replace(shift=average.shift - average.shift[0])
-    at = seen_T, of, float(np.mean(openings_m)), len(counting), Since.REFERENCE, taught_ns, misread, proven
+    at = seen_T, of, float(np.mean(openings_m)), len(fits), Since.REFERENCE, taught_ns, misread, proven
     return AtReference(*at, of_images=True).record(reference.reference_id, digest_of(tracker.measured_as))
 
 
