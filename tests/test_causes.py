@@ -118,7 +118,7 @@ def test_nothing_is_named_when_nothing_moved(outliers: int):
         shown = Shown(sharp_gripper(), seed=seed)
         cause, part, text = told(shown, shown.judge(outliers=outliers), outliers=outliers)
         assert (cause, part) == (Cause.UNKNOWN, None)
-        assert "stand where they did" in text
+        assert "show no motion" in text
 
 
 def test_what_was_wrong_from_the_start_is_no_news():

@@ -314,7 +314,7 @@ def sentence(
     if gone:
         return f"{gone}: hidden, or bent by more than edges are looked for; one image doesn't tell which"
     if best[0] is None and shares[best] >= 0.5:
-        return "every finger and the camera stand where they did"
+        return "the edges that are seen show no motion of the camera or a finger"
     if best[0] is Cause.UNKNOWN and shares[best] >= 0.5:
         return "no single cause explains what is seen: several things may have changed at once"
     said = " or ".join(
