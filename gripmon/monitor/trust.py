@@ -30,11 +30,6 @@ from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRef
 PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
 
-TAUGHT_OTHERWISE = (
-    "where the teaching images had the gripper isn't used: they were measured with other settings; the motion since "
-    "the reference counts from the next 30 frames that prove where it is, or teach again"
-)
-
 
 class _Candidate(NamedTuple):
     """A place where the gripper may be: the measurement, its pose (4, 4) and covariance (6, 6), the fingers' slide from
@@ -51,6 +46,11 @@ class _Candidate(NamedTuple):
 class Integrity:
     """Decides for one monitor's frames, one after the other."""
 
+    taught_otherwise = (
+        "where the teaching images had the gripper isn't used: they were measured with other settings; the motion "
+        "since the reference counts from the next 30 frames that prove where it is, or teach again"
+    )
+
     def __init__(
         self,
         camera: Camera,
@@ -65,7 +65,7 @@ class Integrity:
         """What was measured at the reference in force."""
         self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
         unused = tracker.taught_at[0] is not None and self.since.current is None
-        self.since_refused: str | None = TAUGHT_OTHERWISE if unused else None
+        self.since_refused: str | None = self.taught_otherwise if unused else None
         """Why what the taught edges or a state have about the reference's frames isn't used; None where it is, or there
         is nothing.
         """

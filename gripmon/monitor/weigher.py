@@ -43,8 +43,6 @@ JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
 exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
-LOOKS_OTHERWISE = "the gripper isn't where the images had it that it was taught from: the mount, the light, or the tips"
-
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
 
@@ -55,6 +53,9 @@ class Weigher:
     not_as_expected = (
         "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where "
         "the reference has it"
+    )
+    looks_otherwise = (
+        "the gripper isn't where the images had it that it was taught from: the mount, the light, or the tips"
     )
 
     def __init__(
@@ -245,7 +246,7 @@ class Weigher:
         first, (absolute, since) = self._since.current, both
         away = None if first is None else first.looks_away(cam_T_grip)
         if away is not None:
-            why = LOOKS_OTHERWISE if np.linalg.norm(away[:3]) > since.position_m else since.hypothesis
+            why = self.looks_otherwise if np.linalg.norm(away[:3]) > since.position_m else since.hypothesis
             since = reaching(since, away, why)
         if self.anchor is None and displaced:
             absolute = larger(absolute, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
