@@ -321,7 +321,7 @@ FIELDS = {
     "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
     "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",
 }  # fmt: skip
-ADDED = {"reason", "name", "schema", "protection", "monitor_id", "valid_by", "absolute", "since_reference"}
+ADDED = {"reason", "beside", "name", "schema", "protection", "monitor_id", "valid_by", "absolute", "since_reference"}
 NESTED = {
     "cam_T_grip": {"translation_m", "rotation_xyzw"},
     "smoothed": {"translation_m", "rotation_xyzw", "covariance"},

@@ -47,7 +47,8 @@ def replayed(sequence: Path) -> Lines:
 def lines_of(path: Path) -> Lines:
     """Without what is allowed to differ."""
     lines = [json.loads(line) for line in path.read_bytes().splitlines()]
-    return [{key: value for key, value in line.items() if key not in ("latency_ns", "name")} for line in lines]
+    own = ("latency_ns", "name", "beside")
+    return [{key: value for key, value in line.items() if key not in own} for line in lines]
 
 
 def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, NetworkDaemon]:

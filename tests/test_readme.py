@@ -18,8 +18,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CODE = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
-NOT_SETTINGS = {"jaw.nominal_m"}
-"""Of a gripper file."""
+NOT_SETTINGS = {"jaw.nominal_m", "reference.play", "reference.seen"}
+"""Of a gripper file, and of a taught one."""
 
 
 def _options_of(parser: argparse.ArgumentParser, words: list[str]) -> set[str]:

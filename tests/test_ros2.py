@@ -62,7 +62,8 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
     lines = [json.loads(line) for line in path.read_bytes().splitlines()]
-    return [{key: value for key, value in line.items() if key not in ("latency_ns", "name")} for line in lines]
+    own = ("latency_ns", "name", "beside")
+    return [{key: value for key, value in line.items() if key not in own} for line in lines]
 
 
 @contextmanager

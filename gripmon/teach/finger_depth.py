@@ -25,6 +25,10 @@ LEAST_PLANE_COSINE = 0.25
 CORNER_TURN_SHARE = 0.75
 """Least part of the turn, within the length of a cut corner, that a corner makes at its first vertex.  On the
 tightest curve that isn't a corner, three pieces of 6 px, each vertex makes a third; their scatter may double that."""
+LARGE_TIP = 0.3
+"""Size of a fingertip over its distance from which it has to be seen together with more of its finger: 30 mm at 100 mm,
+a wide tip before a camera that stands near.
+"""
 _ROUNDS = 4
 USUAL_TILT_RAD = math.radians(35.0)
 """Angle between the fingers and the line of sight to their tips, where nothing tells: wrist cameras look along their
@@ -81,7 +85,7 @@ def place(fingers: Sequence[Outline], rotation: Array | None = None, tcp: Array 
         for finger, (tip, sides), turn in zip(fingers, runs, turns, strict=True)
     ]
     tips = [sorted(tip) for tip, _ in runs]
-    if not all(_longer_than_tip(p, tip, direction) for p, tip in zip(points, tips, strict=True)):
+    if not all(_is_plausible(p, tip, direction) for p, tip in zip(points, tips, strict=True)):
         return _flat(fingers, centre, rotation, tcp)
     if rotation is None or tcp is None:
         inner = innermost([p[t] for p, t in zip(points, tips, strict=True)])
@@ -170,13 +174,14 @@ def _in_space(
     return out
 
 
-def _longer_than_tip(points: Array, tip: Sequence[int], direction: Array) -> bool:
-    """Whether a finger, its vertices (v, 3), is seen back from its tip by twice the side of a square as large as that.
-    A side that tapers doesn't run along the finger: in the contact plane it makes a tip about as large as that is long.
+def _is_plausible(points: Array, tip: Sequence[int], direction: Array) -> bool:
+    """Whether a finger, its vertices (v, 3) at about unit depth, has a tip that is small, or seen back from its tip by
+    twice the side of a square as large as that.  A side that tapers doesn't run along the finger: in the contact plane
+    it makes a tip about as large as that is long.
     """
     back = points @ direction
     large = float(np.linalg.norm(np.ptp(points[tip], axis=0)))
-    return bool(math.sqrt(2.0) * large < np.nanmax(back) - np.nanmin(back))
+    return large < LARGE_TIP or bool(math.sqrt(2.0) * large < np.nanmax(back) - np.nanmin(back))
 
 
 def _smooth_turns(finger: Outline, tip: set[int], sides: Sequence[tuple[int, int]]) -> list[int]:
