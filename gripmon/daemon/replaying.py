@@ -100,8 +100,7 @@ def replay(
             warn("the frames have jaw openings, but jaw.source is fixed: they are not used")
         frame = monitor.with_opening(frame)
         # Where frames are missing, so may be the one in which a search's result counted.
-        whole = isinstance(source, RecordedFrames) and not source.frames_without_image
-        then = source.record if whole else None
+        then = source.record if isinstance(source, RecordedFrames) and not source.frames_without_image else None
         start_ns = time.perf_counter_ns()
         try:
             record = monitor.process(frame, None if then is None else then.beside)
