@@ -81,6 +81,23 @@ class Possible:
         return self._kept[key]
 
 
+class _Seen(NamedTuple):
+    """One image to teach from: its fits, what may be wrong with them, the opening, the probability that its ends are
+    something else, and whether it proves where the gripper is.
+    """
+
+    fits: Refits
+    about: About
+    jaw_opening_m: float
+    misread: float
+    proven: bool
+
+    @property
+    def counting(self) -> tuple[Refits, NDArray[np.intp]]:
+        """The fits that count, without the fingers' ends where nothing proves them, and which are the lasting ones."""
+        return self.fits if self.proven else self.fits.under(self.about.without_ends), self.about.rows
+
+
 def seen_in_images(
     tracker: Tracker,
     gripper: Gripper,
@@ -96,7 +113,7 @@ def seen_in_images(
     """
     cam_T_grip = from_record(reference.cam_T_grip)
     possible, risk = Possible(tracker, gripper, settings, cam_T_grip), settings.policy.integrity_risk
-    evidence, fits = EndsEvidence(gripper, tracker.along), list[tuple[Refits, About, float, float, bool]]()
+    evidence, seen = EndsEvidence(gripper, tracker.along), list[_Seen]()
     for number, frame in enumerate(frames):
         measurement = tracker.measure(frame, cam_T_grip, float(number))
         if not measurement.trusted:
@@ -109,17 +126,16 @@ def seen_in_images(
         strictly = misread * MISREAD_PROBABILITY ** strict_fingers(ends)
         proven = proves(ends, elsewhere=False, again=True) or (ends.at_each and within(strictly, risk))
         own = Refits(measurement, about.hypotheses, floor, possible.model, known)
-        fits.append((own, about, measurement.jaw_opening_m, strictly if proven else misread, proven))
-    if not fits:
+        seen.append(_Seen(own, about, measurement.jaw_opening_m, strictly if proven else misread, proven))
+    if not seen:
         return None
-    of_each = [(own if proves_it else own.under(about.without_ends), about.rows) for own, about, *_, proves_it in fits]
-    average = average_of(cam_T_grip, of_each, play)
-    proven = any(each[-1] for each in fits)
-    misread = min(each[3] for each in fits if each[-1] == proven)
-    openings_m = [each[2] for each in fits]
+    average = average_of(cam_T_grip, [each.counting for each in seen], play)
+    proven = any(each.proven for each in seen)
+    misread = min(each.misread for each in seen if each.proven == proven)
+    opening_m = float(np.mean([each.jaw_opening_m for each in seen]))
     seen_T = perturb(cam_T_grip, average.shift[0])
     of = average._replace(shift=average.shift - average.shift[0])
-    at = seen_T, of, float(np.mean(openings_m)), len(fits), Since.REFERENCE, taught_ns, misread, proven
+    at = seen_T, of, opening_m, len(seen), Since.REFERENCE, taught_ns, misread, proven
     return AtReference(*at, of_images=True).record(reference.reference_id, digest_of(tracker.measured_as))
 
 

@@ -269,8 +269,10 @@ class AtReferences:
         first = self.current
         if first is None:
             return 0.0
-        began_ns = self.first_ns if first.of_images and self.first_ns is not None else first.since_ns
-        return 1e-9 * max(self.now_ns - first.since_ns, self.now_ns - began_ns, 0)
+        began_ns = first.since_ns
+        if first.of_images and self.first_ns is not None:
+            began_ns = min(began_ns, self.first_ns)
+        return 1e-9 * max(self.now_ns - began_ns, 0)
 
     @property
     def published_by(self) -> tuple[AtReference | None, Array]:
