@@ -249,8 +249,7 @@ class AtReferences:
         self._known: dict[str, AtReference] = {}
         self.current: AtReference | None = None
         """At the reference in force; None until a frame proves a pose."""
-        self._growing: Average | None = None  # the average that b follows until there are enough frames
-        self._compared: Average | None = None  # the one that is compared with images to teach from as long
+        self._growing: Average | None = None  # the average that b follows, or is compared with
         self._risk = risk
         self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
         self.changes = 0
@@ -310,7 +309,7 @@ class AtReferences:
         """Another reference is in force; one that is restored is still known."""
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
-        self._growing, self._compared, self.current = None, None, self._known.get(self._id)
+        self._growing, self.current = None, self._known.get(self._id)
         self._unproved_T = None
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
@@ -320,10 +319,10 @@ class AtReferences:
 
     def add(self, anchor: Average, jaw_opening_m: float, stamp_ns: int) -> None:
         """A frame counts, which ``anchor`` includes: it has proved a pose, or none has yet."""
-        growing = self._growing
-        if growing is None and self.current is not None:
-            if self.current.of_images and anchor.proven:
-                self._compare(self.current, anchor)
+        growing, taught = self._growing, self._taught
+        if taught is not None and not anchor.proven:
+            return
+        if growing is None and self.current is not None and (taught is None or taught.away is not None):
             return
         if growing is not None and growing is not anchor and not self._was_wrong(growing, anchor):
             self._end()  # the mount was knocked
@@ -332,13 +331,21 @@ class AtReferences:
             self._growing, self._stamps_ns, self._openings_m = anchor, [], []
         self._stamps_ns.append(stamp_ns)
         self._openings_m.append(jaw_opening_m)
-        # A mount that creeps meanwhile stands at the average's place in the middle of its frames.
-        since_ns = self._stamps_ns[(len(self._stamps_ns) - 1) // 2]
-        at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
-        self.current = AtReference(*at, Since.FIRST_PROVED, since_ns, anchor.misread, anchor.proven)
+        if taught is not None:
+            self.current = taught._replace(away=perturbation_between(taught.cam_T_grip, anchor.cam_T_grip))
+        else:
+            # A mount that creeps meanwhile stands at the average's place in the middle of its frames.
+            since_ns = self._stamps_ns[(len(self._stamps_ns) - 1) // 2]
+            at = anchor.cam_T_grip, anchor.fits(), float(np.mean(self._openings_m)), len(self._openings_m)
+            self.current = AtReference(*at, Since.FIRST_PROVED, since_ns, anchor.misread, anchor.proven)
         self._known[self._id] = self.current
-        if len(self._openings_m) >= FIRST_FRAMES:
+        if (len(self._openings_m) if taught is None else anchor.frames) >= FIRST_FRAMES:
             self._end()
+
+    @property
+    def _taught(self) -> AtReference | None:
+        """What is known of the reference in force, if by images to teach from."""
+        return self.current if self.current is not None and self.current.of_images else None
 
     def proved(self) -> None:
         """A frame has proved a pose: what was known of the reference in force without the fingers' ends is dropped."""
@@ -360,19 +367,6 @@ class AtReferences:
         within = np.linalg.norm(away[:3]) <= bound.position_m and np.linalg.norm(away[3:]) <= bound.rotation_rad
         return first.frames <= UNSETTLED_FRAMES and bool(within)
 
-    def _compare(self, first: AtReference, anchor: Average) -> None:
-        """Where this run's first frames have the gripper, beside where images to teach from had it."""
-        before = self._compared
-        if before is None and first.away is not None:
-            return
-        if before is not None and before is not anchor and not self._was_wrong(before, anchor):
-            self._compared, self.changes = None, self.changes + 1  # the mount was knocked
-            return
-        away = perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
-        self._known[self._id] = self.current = first._replace(away=away)
-        enough = anchor.frames >= FIRST_FRAMES
-        self._compared, self.changes = None if enough else anchor, self.changes + enough
-
     def _end(self) -> None:
         self._growing = None
         self._keep(self._id, self._known[self._id])
@@ -387,7 +381,7 @@ class AtReferences:
 
     def state(self) -> tuple[AtReferenceRecord, ...]:
         """What survives a restart: without an average that is still growing, which begins anew."""
-        growing = self._id if self._growing is not None else None
+        growing = self._id if self._growing is not None and self._taught is None else None
         return tuple(at.record(name, self._digest) for name, at in self._known.items() if name != growing)
 
     def begin(self, taught: AtReferenceRecord, lasting: int, fingers: int) -> bool:
