@@ -3,7 +3,7 @@
 gripmon dataset on simulated episodes of 10 s (30 frames/s, AV1). One process on a tenth of them; two processes on all,
 killed by SIGKILL in the middle and called again; Ray on all, with one node of one core and a second one that joins
 after a third; what an episode costs that fails at once, by both; and the driver's end on ten times as many rows.
-Needs '.[datasets,ray]' and two quiet cores; --size 768x576 --episodes 100 is the row for planning.
+Needs two quiet cores; --size 768x576 --episodes 100 is the row for planning.
 """
 
 from __future__ import annotations
