@@ -22,6 +22,7 @@ from support.simulated import BOX_FINGERS, box_model, nominal_cam_T_grip
 from support.taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.cli import main
+from gripmon.cli.teach import written
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
@@ -250,6 +251,13 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
     assert load_config(mine).taught is not None and load_config(mine).taught_path.resolve() == tmp_path / "third.yaml"
     mine.unlink()
     assert len(to_settings(read_yaml(out), TaughtModel).provenance.images) == 1
+
+
+def test_what_makes_the_bound_larger_isnt_advised(rig: Path, taught: Path):
+    unnamed, named, only = load_config(rig / "untaught.yaml"), load_config(rig / "config.yaml"), "only if the edges lie"
+    assert only not in "".join(written(unnamed, taught, pays=True) + written(named, taught, pays=True))
+    assert "add the line `taught:" in written(unnamed, taught, pays=False)[1].split(only)[1]
+    assert "otherwise take the line out again" in written(named, taught, pays=False)[1].split(only)[1]
 
 
 @pytest.mark.parametrize(

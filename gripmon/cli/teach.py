@@ -26,7 +26,7 @@ from gripmon.model.images import image_paths
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.teach.api import Teaching
+    from gripmon.teach.kept import Kept
     from gripmon.teach.measure import Taught
     from gripmon.teach.messages import Saved
     from gripmon.teach.page_server import Site
@@ -139,8 +139,9 @@ def teach(arguments: Arguments) -> None:
     arguments.save("out", taught.text().encode())
     if arguments.into_config:
         config = name_taught(config, out)
-    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(taught)]
-    print("\n".join([*lines, *_written(config, out)]))
+    before, after = taught.kept()
+    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(before, after)]
+    print("\n".join([*lines, *written(config, out, pays=before.median_excess >= after.median_excess)]))
     arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
@@ -156,26 +157,28 @@ def _summary(config: Config, taught: Taught) -> list[str]:
     return lines
 
 
-def _kept_lines(teaching: Teaching) -> list[str]:
+def _kept_lines(before: Kept, after: Kept) -> list[str]:
     """What frames like the images keep, without what was taught and with it, and what makes the bounds as large."""
-    before, after = teaching.kept()
     lines = [f"the monitor over these images: {before.text()}", f"     with what was taught: {after.text()}"]
     lines += [f"     {text}" for text in (after.why(), after.help()) if text]
     if before.median_excess < after.median_excess:
         absolute = "it includes the reference's error now, and " if after.valid_by.value == "absolute" else ""
         lines.append(
             f"note: the bound is larger with what was taught ({absolute}an edge that moves with its background counts "
-            "less): leave `taught:` out of the configuration, unless the edges lie elsewhere than the file has them"
+            "less)"
         )
     return lines
 
 
-def _written(config: Config, out: Path) -> list[str]:
-    lines = [f"written: {out}"]
-    if config.taught_path is None or config.taught_path.resolve() != out.resolve():
-        name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
-        lines.append(f"next: add the line `taught: {name}` to {config.path} (or use --into-config --force)")
-    return lines
+def written(config: Config, out: Path, *, pays: bool) -> list[str]:
+    """What was written, and what to do with it; ``pays``: the bound isn't larger with it."""
+    only = "" if pays else ", only if the edges lie elsewhere than the gripper file has them"
+    if config.taught_path is not None and config.taught_path.resolve() == out.resolve():
+        named = f"next{only}: leave `taught:` in {config.path}; otherwise take the line out again"
+        return [f"written: {out}", *([] if pays else [named])]
+    name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
+    how = f"add the line `taught: {name}` to {config.path} (or use --into-config --force)"
+    return [f"written: {out}", f"next{only}: {how}"]
 
 
 def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
