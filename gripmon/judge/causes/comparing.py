@@ -66,12 +66,13 @@ class Report:
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """``log``: evidence times prior of each model, as a logarithm; ``fits``: its fit; ``blur_change_px``: None where
-    the blur isn't known.
+    the blur isn't known; ``baseline``: whether motions count from frames in which all was well, or the reference.
     """
 
     log: Mapping[Key, float]
     fits: Mapping[Key, Weighed]
     blur_change_px: float | None
+    baseline: bool
 
 
 def compare(
@@ -135,7 +136,7 @@ def compare(
             log[cause, part] += math.log(
                 STRAY_PROBABILITY if part is not None and part not in pooled.absent else chance
             )
-    return Comparison(log, fits, change_px)
+    return Comparison(log, fits, change_px, baseline is not None)
 
 
 def _knowledge(

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
-from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, Weighed
+from gripmon.judge.causes.models import MOST_FOREIGN_EDGES
 from gripmon.judge.causes.pooling import SEEN_EDGES, Baseline, Pooled, pool
 from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.judge.causes.watches import BASELINE_FRAMES
@@ -309,7 +309,7 @@ def sentence(
     gone = f"finger {', '.join(names[f] for f in absent)} is not seen near where it should be" if absent else ""
     named = best[0] not in (None, Cause.UNKNOWN)
     if named and shares[best] >= probable:
-        text = _of(best, comparison.fits[best], comparison.blur_change_px, gripper)
+        text = _of(best, comparison, gripper)
         return f"{text}; {gone}" if gone and best[0] is not Cause.VIEW_BLOCKED else text
     if gone:
         return f"{gone}: hidden, or bent by more than edges are looked for; one image doesn't tell which"
@@ -323,9 +323,9 @@ def sentence(
     return f"this camera can't tell the causes apart: {said}"
 
 
-def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) -> str:
+def _of(key: Key, comparison: Comparison, gripper: Gripper) -> str:
     cause, part = key
-    motion = fit.motion
+    motion, blur_change_px = comparison.fits[key].motion, comparison.blur_change_px
     match cause:
         case Cause.CAMERA_MOUNT:
             shift_mm = 1e3 * float(np.linalg.norm(motion[POSE][:3]))
@@ -335,9 +335,10 @@ def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) 
                 if len(gripper.finger_ids) > 1
                 else "a finger bent so, or something else in place of its end,"
             )
+            since = "since all was well" if comparison.baseline else "from the reference"
             return (
-                f"the camera moved against the gripper: TCP by {shift_mm:.3f} mm, turned by {turn_deg:.3f} degrees; "
-                f"{also} would look the same"
+                f"the camera moved against the gripper: TCP by {shift_mm:.3f} mm, turned by {turn_deg:.3f} degrees "
+                f"{since}; {also} would look the same"
             )
         case Cause.CAMERA_REPLACED:
             return (
