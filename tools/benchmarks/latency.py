@@ -14,7 +14,7 @@ import argparse
 from dataclasses import replace
 from functools import partial
 
-from benchmarks import kit, latency_against, latency_loop, latency_program, parts
+from benchmarks import kit, latency_against, latency_live, latency_loop, latency_program, parts
 from benchmarks.kit import Report
 from benchmarks.parts import LARGE, Frames, Part
 
@@ -22,7 +22,7 @@ _LOOP = {
     "settle": 60, "frames": 2500, "compared": 1000, "block": 100, "beside": 5, "turns": 2, "turn": 150, "gone": 180,
     "staged": 600,
 }  # fmt: skip
-_PROGRAM = {"daemon_s": 4.0, "demo_s": 4.0, "replayed": 200, "starts": 1, "calls": 3}
+_PROGRAM = {"daemon_s": 4.0, "load_s": 4.0, "demo_s": 4.0, "replayed": 200, "starts": 1, "calls": 3}
 """What differs in the plans with --quick."""
 _CLUTTER, _QUIET, _LARGE = Frames(), Frames("quiet"), Frames(size=LARGE, count=45, quick=6)
 _HIDDEN, _LOST = (Frames(kind, count=150, quick=54) for kind in ("hidden", "lost"))
@@ -43,7 +43,8 @@ PARTS = {
     "unreported": _loop("jaw opening unreported against reported", latency_loop.unreported, frames=(_CLUTTER,)),
     "hidden": _loop("a hand covers the gripper", partial(latency_loop.gone, kind="hidden"), frames=(_HIDDEN,)),
     "lost": _loop("the gripper has left the view", partial(latency_loop.gone, kind="lost"), frames=(_LOST,)),
-    "daemon": _program("a live camera at 60 frames/s, with recording", latency_program.daemon, frames=(_QUIET,)),
+    "daemon": _program("a live camera at 60 frames/s, with recording", latency_live.daemon, frames=(_QUIET,)),
+    "load": _program("the same beside two processes that never sleep", latency_live.load, frames=(_QUIET,)),
     "demo": _program("gripmon demo", latency_program.demo),
     "replay": _program("replay of a folder, decoding aside", latency_program.replay, frames=(_QUIET, _CLUTTER)),
     "start": _program("gripmon run to its first transform", latency_program.start, frames=(_CLUTTER,)),

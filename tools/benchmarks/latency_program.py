@@ -1,4 +1,4 @@
-"""The parts of ``tools/bench latency`` that run gripmon as it is used: the daemon on a live camera, commands, start."""
+"""The parts of ``tools/bench latency`` that run gripmon as it is used: commands, replay, start."""
 
 from __future__ import annotations
 
@@ -23,19 +23,13 @@ import msgspec
 import numpy as np
 import yaml
 
-from benchmarks import harness, scene
+from benchmarks import scene
 from benchmarks.harness import free_endpoint
 from benchmarks.machine import ROOT
 from benchmarks.parts import Measured, Row
-from benchmarks.switched import SwitchedRecorder
 from gripmon.io.publish.feeding import FramePublisher
-from gripmon.io.sources import Waiting
-from gripmon.io.sources.realtime import SimulatedCamera
-from gripmon.model.records import Frame
 
-OF_A_CORE, REPLAYED_PER_S, START_S, HELP_S, IMPORT_S, ABOVE_MB = 12.0, 800.0, 1.5, 0.1, 0.2, 100.0
-_BEGIN_S = 2.0
-"""Of the daemon's run, before the loop's time counts."""
+REPLAYED_PER_S, START_S, HELP_S, IMPORT_S, ABOVE_MB = 800.0, 1.5, 0.1, 0.2, 100.0
 _START_WITHIN_S = 120.0  # the first start may compile
 _LIBRARIES = "numba, cv2, scipy, zenoh"
 _GRIPMON = (sys.executable, "-m", "gripmon")
@@ -46,96 +40,11 @@ class Plan:
     """How long the daemon and the demo run; images that are replayed; starts and calls that are timed."""
 
     daemon_s: float = 60.0
+    load_s: float = 30.0
     demo_s: float = 20.0
     replayed: int = 600
     starts: int = 5
     calls: int = 9
-
-
-@dataclass(frozen=True)
-class _Maker:
-    """The camera's frames, in its own process: rendered before, so that they cost it next to nothing."""
-
-    path: Path
-    kept: list[scene.Ring] = dataclasses.field(default_factory=list, compare=False)
-
-    def frame(self, index: int) -> Frame:
-        if not self.kept:
-            self.kept.append(scene.Ring.load(self.path))
-        return self.kept[0].frame(index)
-
-
-class _Live(harness.RingSource):
-    """A camera that waits for no one, switched on when the loop first asks; notes the time of its frames, and the
-    loop's use of its core.
-    """
-
-    live = True
-
-    def __init__(self, ring: scene.Ring, path: Path, count: int) -> None:
-        super().__init__(ring, count)
-        self._path, self._size = path, ring.size
-        self._camera: SimulatedCamera | None = None
-        self._begun: tuple[float, float, float] | None = None
-        self.loop_s = self.process_s = self.wall_s = 0.0
-
-    @property
-    def dropped(self) -> int:  # type: ignore[override]
-        return 0 if self._camera is None else self._camera.dropped
-
-    def read(self) -> Frame | Waiting | None:  # type: ignore[override]
-        if self._camera is None:
-            self._camera = SimulatedCamera(
-                _Maker(self._path), size_px=self._size, fps=scene.FPS, name="bench", frame_count=self._count
-            )
-        item = self._camera.read()
-        if isinstance(item, Frame):
-            self.handed_ns[item.seq] = time.monotonic_ns()
-            self._look(item.seq)
-        return item
-
-    def _look(self, seq: int) -> None:
-        now = time.thread_time(), time.process_time(), time.monotonic()
-        if self._begun is None:
-            if seq >= _BEGIN_S * scene.FPS:
-                self._begun = now
-            return
-        self.loop_s, self.process_s, self.wall_s = (b - a for a, b in zip(self._begun, now, strict=True))
-
-    def close(self) -> None:
-        if self._camera is not None:
-            self._camera.close()
-
-
-def daemon(paths: tuple[Path, ...], plan: Plan) -> Measured:
-    """A live camera at 60 frames/s, the loop with its publisher and its recording, on any core."""
-    ring = scene.Ring.load(paths[0])
-    config = scene.config_for(ring.size)
-    count = round((_BEGIN_S + plan.daemon_s) * scene.FPS)
-    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
-        recorder = SwitchedRecorder(config, Path(scratch))
-        recorder.on = True
-        source = _Live(ring, paths[0], count)
-        with harness.published(config) as (publisher, subscriber):
-            harness.run_loop(config, source, publisher, recorder)
-        written = sum(file.stat().st_size for file in Path(scratch).glob("*.rrd"))
-    came = source.handed_ns >= 0
-    came[: round(_BEGIN_S * scene.FPS)] = False
-    ms = harness.summary(1e-3 * source.latency_us()[came])
-    share, whole = (100.0 * s / source.wall_s for s in (source.loop_s, source.process_s))
-    return Measured(
-        (
-            Row("daemon at 60 frames/s with recording: the loop's thread", share, "% of a core", OF_A_CORE,
-                note=f"the whole process {whole:.3g} %, and the recording's own process"),
-            Row(f"frames dropped in {_BEGIN_S + plan.daemon_s:g} s", source.dropped, "frames", 0,
-                note="aimed at in ten minutes: --daemon-s 600" if plan.daemon_s < 600.0 else ""),
-            Row("frames that the recording dropped", recorder.dropped, "frames", 0,
-                note=f"{1e-6 * written:.0f} MB written"),
-            Row("frame handed over -> published, median", ms["median"], "ms",
-                note=f"99 % {ms['p99']:.3g} ms, longest {ms['max']:.3g} ms"),
-        ),
-        (f"the subscriber in another process received {len(subscriber.seqs):,} of {count:,}",),
-    )  # fmt: skip
 
 
 def demo(_: tuple[Path, ...], plan: Plan) -> Measured:
