@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
 from gripmon.monitor.bounds import ModelError
+from gripmon.monitor.since import AtReference, Opened
 from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -279,3 +281,14 @@ def test_an_average_of_images_claims_no_more_than_they_show(frames: int, common:
         assert np.mean(claimed) > 0.85
     elif common == 0.0 and frames == 12 and times < 1.0:
         assert np.mean(claimed) < 0.85
+
+
+def test_play_of_the_mount_is_in_what_a_motion_counts_from_once():
+    """The scatter of averages over 1,500 teachings, each of images at places of its own, beside what they claim."""
+    rng, play, frames = np.random.default_rng(5), 20.0 * SIGMA, 6
+    seen = [stream(rng, frames, 0.0, rng.normal(size=(frames, 6)) * play) for _ in range(1500)]
+    averages = [average_of(BASE_T, [(frame, ROWS) for frame in each], play) for each in seen]
+    at = AtReference(BASE_T, averages[0], 0.03, frames, Since.REFERENCE, 0, SURE, True, of_images=True)
+    counts = at.differences(BASE_T, BASE_T, Opened(0.03, np.zeros(6)), None, np.square(play))
+    claimed = counts.begun.covariance[0].diagonal()
+    np.testing.assert_allclose(claimed, np.square([each.shift[0] for each in averages]).mean(axis=0), rtol=0.2)

@@ -218,8 +218,8 @@ class AtReference(NamedTuple):
         which a mount that vibrates differs from its average.
         """
         lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
-        # Each image was at another place of what swings.
-        more, travel = np.diag(swing) / (self.frames if self.of_images else 1), np.zeros(6)
+        # That each image was at another place is in their average (``average_of``).
+        more, travel = np.zeros((6, 6)) if self.of_images else np.diag(swing), np.zeros(6)
         by_motion = np.zeros((0, 6, 3))
         if common is not None:
             travel_m = opened.jaw_opening_m - self.jaw_opening_m
