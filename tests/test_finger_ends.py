@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from support.simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario,
 
 from gripmon.daemon.config import read_gripper
 from gripmon.model.gripper import Gripper
+from gripmon.monitor.ends import proof
 from gripmon.simulate import Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement, MeasurementSettings
@@ -235,3 +237,26 @@ def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Grippe
     assert usable.sum() >= 5
     assert ends.might.tolist() == [visible.sum()] and ends.seen.tolist() == [usable.sum()]
     assert ends.sure
+
+
+@pytest.mark.parametrize("displaced", [False, True])
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("along", [None, 1e-3])
+def test_what_proves_a_pose_is_what_the_page_of_bounds_says(displaced: bool, again: bool, along: float | None):
+    """Of two fingers with two corners each, for every number of these that is seen, and seen strictly."""
+    risk, might = 1e-5, np.array([2, 2])
+    for a, b, sa, sb in itertools.product(range(3), repeat=4):
+        if sa > a or sb > b:
+            continue
+        misread = 0.1 ** (a + b)
+        ends = FingerEndsSeen(np.array([a, b]), might, np.array([sa, sb]))
+        found = proof(ends, misread, risk, displaced, again, along)
+        corners, each, expected = a + b, a > 0 and b > 0, not displaced or along is not None
+        whole = int(a > 0 and sa == a) + int(b > 0 and sb == b)
+        proven = each and corners == 4
+        proven |= sa + sb > 0 and ((expected and corners >= 3) or (again and each))
+        left = misread * 0.1**whole * (1.0 if along is None else along)
+        proven |= each and (whole > 0 or not displaced) and left < 1.0001 * risk
+        assert found.proven == proven
+        assert found.misread == pytest.approx(misread * 0.1**whole if proven else misread)
+    assert proof(None, 0.1, risk, displaced, again, along) == (False, 0.1)

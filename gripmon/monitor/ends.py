@@ -5,6 +5,8 @@ Only the ends show a motion along the fingers; a rim, a plate's border, a step o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,25 +75,43 @@ class EndsEvidence:
         return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
 
-def strict_fingers(ends: FingerEndsSeen) -> int:
-    """At how many fingers nothing goes on beyond any of the corners seen, even by a few pixels."""
-    return int(np.count_nonzero((ends.seen > 0) & (ends.strictly >= ends.seen)))
-
-
 def within(probability: float, risk: float) -> bool:
     """Whether a probability is no more than a risk; powers of ten are equal but for rounding."""
     return probability <= (1.0 + 1e-9) * risk
 
 
-def proves(ends: FingerEndsSeen | None, elsewhere: bool, again: bool) -> bool:
-    """Whether the fingers' ends are seen as ends.  Not ``elsewhere`` than expected fewer corners suffice; where the
-    innovation is within noise (``again``), one of each finger; but one of these strictly, since a slide by a few pixels
-    shows everywhere that something goes on.
+class Proof(NamedTuple):
+    """Whether the fingers' ends prove a pose, and with which probability what looks like them is something else."""
+
+    proven: bool
+    misread: float
+
+
+def proof(
+    ends: FingerEndsSeen | None,
+    misread: float,
+    risk: float,
+    displaced: bool = False,
+    again: bool = True,
+    along: float | None = None,
+) -> Proof:
+    """What fingers' ends say that are something else with a probability ``misread``; None: not checked, no proof.
+
+    Where the pose is expected, or the fingers' strips are seen, ``along``, which leave that part of a misreading, fewer
+    corners suffice than where it is ``displaced``; where the innovation is within noise (``again``), one of each
+    finger; but one of these strictly, since a slide by a few pixels shows everywhere that something goes on.  Each
+    finger beyond whose ends nothing goes on even by a few pixels is worth as much as one more corner.  Narrow tips may
+    show one corner each: they prove a pose, too, where all of that together leaves no more than the ``risk``.
     """
     if ends is None:
-        return False
-    expected = not elsewhere and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
-    return ends.sure or ((expected or (again and ends.at_each)) and bool(ends.strictly.any()))
+        return Proof(False, misread)
+    strictly = int(np.count_nonzero((ends.seen > 0) & (ends.strictly >= ends.seen)))
+    left = misread * MISREAD_PROBABILITY**strictly
+    enough = int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED and (along is not None or not displaced)
+    proven = ends.sure or ((enough or (again and ends.at_each)) and bool(ends.strictly.any()))
+    if ends.at_each and (strictly or not displaced):
+        proven = proven or within(left * (1.0 if along is None else along), risk)
+    return Proof(proven, left if proven else misread)
 
 
 def _on_one_line(measurement: Measurement, edges: NDArray[np.intp]) -> bool:

@@ -23,7 +23,7 @@ from gripmon.monitor.bounds import (
     unbounded,
 )
 from gripmon.monitor.common import CommonError, Tilt
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
+from gripmon.monitor.ends import EndsEvidence, proof
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReference, Bounds, digest_of
@@ -122,11 +122,9 @@ def seen_in_images(
         ends, about = tracker.ends(frame, measurement), possible.about(measurement.normal.edge)
         known = _nothing_known(measurement.cam_T_grip)
         floor = tracker.floor_of(measurement)
-        misread = evidence.misread(measurement, ends)
-        strictly = misread * MISREAD_PROBABILITY ** strict_fingers(ends)
-        proven = proves(ends, elsewhere=False, again=True) or (ends.at_each and within(strictly, risk))
+        of_ends = proof(ends, evidence.misread(measurement, ends), risk)
         own = Refits(measurement, about.hypotheses, floor, possible.model, known)
-        seen.append(_Seen(own, about, measurement.jaw_opening_m, strictly if proven else misread, proven))
+        seen.append(_Seen(own, about, measurement.jaw_opening_m, of_ends.misread, of_ends.proven))
     if not seen:
         return None
     average = average_of(cam_T_grip, [each.counting for each in seen], play)

@@ -21,7 +21,7 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
 from gripmon.monitor.anchor import Anchor
 from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proves, strict_fingers, within
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
@@ -150,10 +150,8 @@ class Weigher:
         ``ends``: the fingers' ends as seen; None if not checked.  ``explained``: number of the hypothesis under which
         the pose follows from the anchor.  ``look_seen``: the gripper's look is seen there.  ``slid``: the fingers'
         strips are seen elsewhere, so that something else was taken for their ends.  ``seen_along``: they are seen
-        there: as few corners prove the pose as where it is expected, and a lone finger hasn't slid.  Each finger beyond
-        whose ends nothing goes on even by a few pixels is worth as much as one more corner.  Of narrow tips a view may
-        have one corner each: they prove the pose, too, where all of that together leaves no more than the risk that
-        they are something else.
+        there: as few corners prove the pose as where it is expected (:func:`~gripmon.monitor.ends.proof`), and a lone
+        finger hasn't slid.
         """
         risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
         if not len(edges):
@@ -164,17 +162,13 @@ class Weigher:
         displaced = not fits.stays[0] and explained is None
         # The proof: fingers' ends that can't be something else.
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
-        proven = not slid and proves(ends, displaced and not seen_along, again)
         may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 1.0 if slid else self._ends.misread(measurement, ends, kept)
-        strictly = 0 if ends is None else strict_fingers(ends)
-        misread_strictly = misread * MISREAD_PROBABILITY**strictly
+        proven, misread = False, 1.0
         since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
-        if ends is not None and ends.at_each and not slid and (strictly or not displaced):
-            proven = proven or within(misread_strictly * since_learnt, risk)
-        if proven:
-            misread = misread_strictly
+        if not slid:
+            of_ends = self._ends.misread(measurement, ends, kept)
+            proven, misread = proof(ends, of_ends, risk, displaced, again, LOOK_ODDS if seen_along else None)
         # The priors: only that of the ends depends on the frame.
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
