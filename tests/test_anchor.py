@@ -10,9 +10,9 @@ import pytest
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
-from gripmon.monitor.bounds import ModelError
+from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
 from gripmon.monitor.since import AtReference, Opened
-from gripmon.track.integrity import hypotheses_of
+from gripmon.track.integrity import bounds, hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 SAID = tuple(f"edge {name}" for name in NAMES)
@@ -292,3 +292,27 @@ def test_play_of_the_mount_is_in_what_a_motion_counts_from_once():
     counts = at.differences(BASE_T, BASE_T, Opened(0.03, np.zeros(6)), None, np.square(play))
     claimed = counts.begun.covariance[0].diagonal()
     np.testing.assert_allclose(claimed, np.square([each.shift[0] for each in averages]).mean(axis=0), rtol=0.2)
+
+
+@pytest.mark.parametrize("common", [0.0, 0.5, 1.0])
+def test_where_a_mount_stood_that_crept_in_its_frames_is_in_what_a_motion_counts_from(common: float):
+    """At any of 30 frames, within what bounds normal errors of that covariance at the usual risk: a mount that crept
+    all the time, in the first half, or in the second.
+    """
+    rng, sigma = np.random.default_rng(17), np.sqrt(shape_of()[0].diagonal())
+    for law in (np.linspace(0.0, 1.0, 30), np.linspace(0.0, 2.0, 30).clip(max=1.0), np.linspace(-1.0, 1.0, 30)):
+        for way in (0.0, 0.5, 2.0, 8.0, 32.0) * 10:
+            truth = way * law.clip(min=0.0)[:, None] * sigma * rng.normal(size=6) / np.sqrt(6.0)
+            anchor = averaged(stream(rng, 30, common, truth))
+            off_m = perturbation_between(BASE_T, anchor.cam_T_grip)[:3] - truth[:, :3]
+            known_m = SIGMA_INFLATION * bounds(anchor.fits().covariance[:1, :3, :3], np.array([1e-5]))
+            assert (np.linalg.norm(off_m, axis=1) < known_m).all()
+
+
+def test_frames_of_a_mount_that_stood_still_do_not_show_a_creep():
+    rng, more = np.random.default_rng(18), []
+    for _ in range(40):
+        anchor = averaged(stream(rng, 30, 0.5))
+        one_m2 = np.trace(shape_of()[0, :3, :3])
+        more.append(np.trace(anchor.fits().covariance[0, :3, :3] - anchor._claimed[0, :3, :3]) / one_m2)
+    assert np.mean(more) < 0.02

@@ -36,7 +36,7 @@ from gripmon.monitor.common import CommonError
 from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, Opened
 from gripmon.monitor.tracker import Tracker
 from gripmon.simulate import Scenario, paper_rig
-from gripmon.simulate.scenario import Bump, FingerLook, FingerShape, JawScript
+from gripmon.simulate.scenario import Bump, Creep, FingerLook, FingerShape, JawScript, MountScript, Vibration
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.integrity import Cases, Separation
 
@@ -282,6 +282,30 @@ def test_what_valid_by_names_is_what_is_published_and_judged():
     assert np.linalg.norm(difference(*measured)[:3]) < 5e-5
 
 
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Creep(law="linear", time_s=4.0, translation_m=(2e-4, 0.0, 0.0)),
+        Creep(law="linear", time_s=4.0, translation_m=(5e-4, 0.0, 0.0)),
+        Vibration(translation_m=(2e-4, 0.0, 0.0), frequency_hz=1.7),
+    ],
+    ids=["creeps", "creeps faster", "vibrates"],
+)
+def test_a_mount_that_moves_in_the_first_proved_frames_is_within_its_bound(motion: MountScript):
+    """By the truth at the stamp from which the motion counts, though the average follows the mount meanwhile."""
+    pose, truths = nominal_cam_T_grip(), dict[int, np.ndarray]()
+    settings = MonitorSettings(policy=BY_REFERENCE)
+    monitor = Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), settings, reference_at(pose))
+    for frame, truth in zip(*rendered(scene(80, mount=(motion,))), strict=True):
+        record = monitor.process(frame)
+        monitor.run_pending()
+        truths[frame.stamp_ns], since = truth.cam_T_grip, record.since_reference
+        assert record.cam_T_grip is not None and since is not None
+        then_T = truths[since.since_ns]
+        error = difference(pose_of(record.cam_T_grip), truth.cam_T_grip @ np.linalg.inv(then_T) @ pose)
+        assert np.linalg.norm(error[:3]) < since.position_m and np.linalg.norm(error[3:]) < since.rotation_rad
+
+
 # --- when it begins ---
 
 
@@ -312,6 +336,18 @@ def test_it_is_the_average_of_the_first_frames_that_proved_a_pose():
     assert at is not None and (at.frames, at.since_ns, at.since) == (30, 1014, Since.FIRST_PROVED)
     assert at.cam_T_grip[0, 3] == pytest.approx(30e-6)
     assert at.jaw_opening_m == pytest.approx(0.03 + 1e-5 * 14.5)
+
+
+def test_what_is_published_counts_from_what_its_bound_was_computed_with():
+    """Not from an average that the same frame has moved on."""
+    kept, anchor, way_m = begun(), Mean(np.eye(4)), 1e-3
+    kept.add(anchor, 0.03, 1)
+    kept.weighed = kept.current
+    anchor.cam_T_grip = moved(np.eye(4), np.array([way_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    kept.add(anchor, 0.03, 2)
+    assert kept.quantity(np.eye(4), np.eye(6))[0][0, 3] == 0.0
+    kept.weighed = kept.current
+    assert kept.quantity(np.eye(4), np.eye(6))[0][0, 3] == pytest.approx(-way_m)
 
 
 def test_before_a_frame_has_proved_a_pose_the_motion_is_that_since_the_first_one():

@@ -8,6 +8,7 @@ in the average's covariance, as in :mod:`gripmon.judge.smoothing`.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
 from gripmon.monitor.bounds import SIGMA_INFLATION, protection_of
 from gripmon.monitor.refits import Refits
+from gripmon.monitor.since import FIRST_FRAMES
 from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, follow, telling, with_known
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
@@ -113,6 +115,7 @@ class Anchor:
         self.now_s, self.frames = now_s, 1
         self._to_confirm = CONFIRMING_FRAMES if knocked else 0
         self._filters = _chosen(fits, rows, base_T)
+        self._newest = deque([(self._filters.shift[0].copy(), self._filters.covariance[0].copy())], FIRST_FRAMES)
         self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
         self._scatter = np.zeros((len(rows), 6))
         self._weight = PRIOR_FRAMES
@@ -139,6 +142,7 @@ class Anchor:
         self.frames += 1
         self._to_confirm -= 1
         frame = _chosen(fits, rows, self._base_T)
+        self._newest.append((frame.shift[0], frame.covariance[0]))
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
         self._filters, gains = follow(self._filters, frame, creep)
         origin_T, known = self._origin
@@ -166,9 +170,30 @@ class Anchor:
         self.of_model: Array = of_model
 
     def fits(self) -> Separation:
-        """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`."""
+        """The averages under the lasting hypotheses, as shifts from :attr:`cam_T_grip`, of where the gripper was at any
+        of the newest frames: a mount that crept stood elsewhere than on average.
+        """
         shift = self._filters.shift - perturbation_between(self._base_T, self.cam_T_grip)
-        return Separation(shift, self._claimed, self._filters.of_model)
+        return Separation(shift, self._claimed + self._crept, self._filters.of_model)
+
+    @property
+    def _crept(self) -> Array:
+        """(6, 6) squared ways from the average to the newest frames' places, on average, of the position and of the
+        rotation, but for what is explained by their errors, and by what more they scatter from one to the next: half of
+        the squared way between these (von Neumann 1941), which no creep adds to.  The surer frames weigh more.
+        """
+        places, errors = (np.array(each) for each in zip(*self._newest, strict=True))
+        way, out = places - perturbation_between(self._base_T, self.cam_T_grip), np.zeros((6, 6))
+        step = np.diff(places, axis=0, prepend=places[:1])
+        for part in (slice(0, 3), slice(3, 6)):
+            error = errors[:, part, part]
+            weight = 1.0 / np.einsum("nii->n", error)
+            apart, known, steps = (
+                np.einsum("n,nij->ij", weight / weight.sum(), each)
+                for each in (_squares(way[:, part]), error, 0.5 * _squares(step[:, part]))
+            )
+            out[part, part] = _positive(apart - known - _positive(steps - known))
+        return out
 
     def bound(self, risk: float) -> Protection:
         """The protection level of the average itself."""
@@ -228,6 +253,16 @@ def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]],
     young = np.clip(np.einsum("hii->hi", covariance) / usual, 1.0 / count, 1.0)
     claimed = _claimed(covariance, young, scatter / (count - 1 + PRIOR_FRAMES)) + places / count[:, :, None]
     return Separation(mean, 0.5 * (claimed + claimed.transpose(0, 2, 1)), of_model)
+
+
+def _squares(ways: Array) -> Array:
+    return ways[:, :, None] * ways[:, None, :]
+
+
+def _positive(matrix: Array) -> Array:
+    """A symmetric matrix without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _claimed(covariance: Array, young: Array, scatter: Array) -> Array:

@@ -218,7 +218,7 @@ class AtReference(NamedTuple):
         which a mount that vibrates differs from its average.
         """
         lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
-        # That each image was at another place is in their average (``average_of``).
+        # That each image was at another place is in their average.
         more, travel = np.zeros((6, 6)) if self.of_images else np.diag(swing), np.zeros(6)
         by_motion = np.zeros((0, 6, 3))
         if common is not None:
@@ -252,6 +252,10 @@ class AtReferences:
         self._growing: Average | None = None  # the average that b follows, or is compared with
         self._risk = risk
         self._unproved_T: Array | None = None  # of the first frame, while none has proved a pose
+        self.weighed: AtReference | None = None
+        """What the newest bounds count from: until the next ones what is published does, too, though by now their frame
+        counts in the average; None before there is any: from :attr:`current`.
+        """
         self.changes = 0
         """Grows with each change that a restart should know."""
         self.now_ns = 0
@@ -285,7 +289,7 @@ class AtReferences:
         """
         if self._valid_by is ValidBy.ABSOLUTE:
             return cam_T_grip, covariance
-        first = self.current
+        first = self.weighed or self.current
         if first is None:
             if self._unproved_T is None:
                 self._unproved_T = cam_T_grip
@@ -295,7 +299,7 @@ class AtReferences:
 
     def named(self, cam_T_grip: Array, covariance: Array, both: Bounds) -> Named:
         """What is published of a measured pose (4, 4), its covariance (6, 6) and bounds."""
-        (absolute, since), first, at = both, self.current, to_record(cam_T_grip)
+        (absolute, since), first, at = both, self.weighed or self.current, to_record(cam_T_grip)
         return Named(
             *self.quantity(cam_T_grip, covariance),
             both.by(self._valid_by),
@@ -310,7 +314,7 @@ class AtReferences:
         self._id = reference.restores or reference.reference_id
         self.reference_T = from_record(reference.cam_T_grip)
         self._growing, self.current = None, self._known.get(self._id)
-        self._unproved_T = None
+        self._unproved_T = self.weighed = None
 
     def measured(self, reference: ReferenceRecord, anchor: Average, jaw_opening_m: float) -> None:
         """A reference is measured again, in force or only proposed, from frames that ``anchor`` is the average of."""

@@ -165,6 +165,7 @@ class Integrity:
         self.since.now_ns = frame.stamp_ns
         if self.since.first_ns is None:
             self.since.first_ns = frame.stamp_ns
+        first = self.since.current
         if measurement.trusted:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)
@@ -177,6 +178,8 @@ class Integrity:
                 why = f"{self._weigher.not_as_expected}, and no frame has proved yet where it is"
             none = unbounded(self._policy.integrity_risk, why).since_reference
             standing = replace(standing, bounds=standing.bounds._replace(since_reference=none))
+        if standing is not None:
+            self.since.weighed = first
         return standing
 
     def _past_limit(self, both: Bounds) -> bool:
