@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.ranks import median
 from gripmon.model.records import Array, Image
-from gripmon.model.staying import LEAST_SLOPE, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
+from gripmon.model.staying import LEAST_SLOPE, STAYING_PART, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
 from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 5
@@ -330,15 +331,25 @@ def _directions(image: Plane) -> Plane:
 
 
 def _differ(features: Plane, one: list[int], other: list[int]) -> bool:
-    """Whether more stays in each of two sets of images than in both together."""
+    """Whether more stays in each of two sets of images than in both together.  Images of a video follow each other
+    before much the same background, which stays in a set as well: what does by chance is measured, where nothing stays
+    in both.
+    """
     if min(len(one), len(other)) < FEWEST_IMAGES:
         return False
-    least = min(_staying_energy(features[one]), _staying_energy(features[other]))
-    return least > _staying_energy(features[one + other])
+    both = [_resultant(features[own]) for own in (one, other, one + other)]
+    mean, each = both[-1]
+    changing = mean < STAYING_PART**2 * each
+    energies = []
+    for (mean, each), count in zip(both, (len(one), len(other), len(one) + len(other)), strict=True):
+        shown = changing & (each > 0.0)
+        usual = float(np.median(mean[shown] / each[shown])) if shown.any() else 0.0
+        # Random directions' squared mean is exponentially distributed, so that its median is ln 2 of its mean.
+        chance = max(usual / math.log(2.0), 1.0 / count)
+        energies.append(float(np.maximum(mean - 3.0 * chance * each, 0.0).sum()))
+    return min(energies[:2]) > energies[2]
 
 
-def _staying_energy(features: Plane) -> float:
-    """Sum of the squares of the mean directions, without what n random ones give."""
-    mean = np.square(features.mean(axis=0)).sum(axis=0)
-    each = np.square(features).sum(axis=1).mean(axis=0)
-    return float(np.maximum(mean - 3.0 * each / len(features), 0.0).sum())
+def _resultant(features: Plane) -> tuple[Plane, Plane]:
+    """Square of the mean direction (h, w) over images (n, 2, h, w), and the mean square of each one's."""
+    return np.square(features.mean(axis=0)).sum(axis=0), np.square(features).sum(axis=1).mean(axis=0)
