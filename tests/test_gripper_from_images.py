@@ -192,7 +192,7 @@ def test_what_would_help_depends_on_what_is_missing(clear: int, same: bool, word
     assert between.endswith(", and with nothing between the jaws") == (same and clear == 6)
 
 
-@pytest.mark.parametrize(("quality", "written"), [(40, True), (15, False)])
+@pytest.mark.parametrize(("quality", "written"), [(15, True), (5, False)])
 def test_blocks_of_strong_compression_are_no_edges_and_are_named(quality: int, written: bool) -> None:
     """Their borders lie on a grid that stays in all images."""
     simulator = moving_robot(**SCENES["plain look"])
