@@ -109,6 +109,20 @@ def test_what_edges_enclose_is_the_gripper_and_no_plain_wall(count: int, wall: b
     assert (found & ~still).sum() < 0.15 * still.sum()
 
 
+def test_soft_shading_that_comes_and_goes_on_a_plain_body_is_no_background():
+    """A coder leaves a black surround without noise: slopes of a level and a half are many times that."""
+    still = polygons([(60, 239), (60, 120), (260, 120), (260, 239)])
+    rng, shown = np.random.default_rng(6), []
+    for image in pictures(still, 12, False):
+        shade = cv2.GaussianBlur(rng.normal(size=SHAPE), (0, 0), 6.0)
+        shade *= 1.2 / np.hypot(*np.gradient(shade)).mean()
+        clean = np.where(cv2.erode(still.astype(np.uint8), np.ones((9, 9))) > 0, 90.0 + shade, image)
+        clean[:40] = 0.0
+        shown.append(clean.astype(np.float32))
+    found = enclosed(edges_that_stay(shown))
+    assert found is not None and (found & still).sum() > 0.9 * still.sum()
+
+
 def test_a_small_face_on_which_shadows_come_and_go_is_the_grippers():
     """Beside a finger at the image's border, smaller than a cell: by how much of it changes, it began as background."""
     pad = [(100, 229), (112, 229), (112, 239), (100, 239)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -189,6 +190,20 @@ def test_openings_are_told_apart_without_a_table() -> None:
     sets = image_sets([images[k] for k in order])
     assert [{order[k] for k in own} for own in sets] == wanted
     assert image_sets(images[:16]) == [list(range(16))]
+
+
+def test_a_slow_video_of_one_opening_is_one_set() -> None:
+    """Three times a camera stays before about the same view, which then stays in a third of the images."""
+    rng = np.random.default_rng(5)
+    texture = cv2.GaussianBlur(rng.normal(size=(700, 900)), (0, 0), 3.0)
+    texture = (110.0 + 25.0 * texture / texture.std()).astype(np.float32)
+    images = []
+    for k in range(36):
+        left, top = 200 * (k // 12) + rng.integers(0, 12), 10 + k
+        image = texture[top : top + 240, left : left + 320].copy()
+        image[140:, 80:120] = image[140:, 200:240] = 230.0
+        images.append(image + rng.normal(0.0, 1.0, image.shape).astype(np.float32))
+    assert image_sets(images) == [list(range(36))]
 
 
 def test_a_camera_that_moved_between_sets_of_images_is_refused() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from gripmon.teach.image_motion import Unfit
-from gripmon.teach.jaw_fit import _best_of, _Solved
+from gripmon.teach.jaw_fit import _best_of, _Fit, _Solved
 from gripmon.teach.jaw_unknowns import _shown
 from gripmon.teach.vanishing import Outline
 
@@ -55,3 +56,15 @@ def test_a_border_behind_which_a_finger_comes_out_isnt_placed_by_its_motion() ->
     finger = Outline("left", xy, corner, pieces, np.array([0.0, 1.0]), lengths, np.zeros((0, 2, 2)), NONE)
     assert _shown(finger, np.array([1.0, 0.0])) == pieces[1:]
     assert _shown(finger, np.array([0.8, 0.6])) == pieces
+
+
+@pytest.mark.parametrize(
+    ("openings", "chi2", "turn"), [(1, 10.0, False), (1, 13.0, True), (3, 15.0, False), (3, 25.0, True)]
+)
+def test_turns_of_several_openings_explain_noise_without_a_turn(openings: int, chi2: float, turn: bool) -> None:
+    """Two fingers' turns each: of 2 or 6 unknowns chi-squared is below 11.8 or 20.1 in 99.73 % (its tables)."""
+    free = np.repeat([True, False], [4, 2 * openings])
+    best = _Solved(NONE, NONE, NONE, 100.0, 1.0, NONE, free)
+    turning = _Solved(NONE, NONE, np.full(2 * openings, 0.02), 100.0 - chi2, 1.0, NONE, free | True)
+    fit: Any = SimpleNamespace(solve=lambda *_, **__: turning, frame=lambda _: (NONE, NONE), placed=True)
+    assert bool(_Fit.turned(fit, best)) == turn

@@ -41,7 +41,8 @@ NOISE_SLOPES = 3.0
 STAYING_PART = 0.35
 """Where between chance (0) and all images (1) an edge stays: a third of the images may show something else there."""
 CHANGING_SLOPES = 4.0
-"""Slope that a fifth of the images show, over noise's: noise exceeds it in one of 3,000 (Rayleigh: exp(-8))."""
+"""Slope that a fifth of the images show, over noise's: noise exceeds it in one of 3,000 (Rayleigh: exp(-8)).  At least
+that of an edge that counts: shading and a coder's errors come and go on a plain body as well."""
 CHANGING_FACTOR = 2.5
 """... and over the slope that two thirds of the images show, which on a standing edge is about the same."""
 CHANGING_PART = 0.3
@@ -110,7 +111,7 @@ def edges_that_stay(images: Sequence[Plane]) -> Edges:
     full = max(NOISE_SLOPES * noise, LEAST_SLOPE)
     share, across_rad = _share(images, full)
     chance, _ = _share(_displaced(images), full)
-    changing = (high > CHANGING_SLOPES * noise) & (high > CHANGING_FACTOR * usual)
+    changing = (high > max(CHANGING_SLOPES * noise, LEAST_SLOPE)) & (high > CHANGING_FACTOR * usual)
     edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()), usual)
     return replace(edges, changing=changing & (share < max(edges.limit, 0.6)))
 

@@ -97,7 +97,8 @@ def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Se
     if count != 1 and len(alike) == 1 and len(found) > 1:  # the largest may be a cable
         raise UnclearPartsError(
             f"{len(found)} parts that stay may be fingers, one much larger than the others (see --picture); --fingers "
-            "1 if that is the gripper's only one, else --within LEFT,TOP,RIGHT,BOTTOM around each finger, in pixels",
+            "1 if that is the gripper's only one, else --within LEFT,TOP,RIGHT,BOTTOM around each finger without what "
+            "it holds, in pixels",
             [own[0] for own in found],
             still,
         )
@@ -128,7 +129,7 @@ def _chosen(found: list[_Part], still: Bits, wanted: int) -> Parts:
     if not parts:
         raise UnclearPartsError(
             "what stays in the images has no finger's shape: it should enter from the image's border or from a palm "
-            "and end in view",
+            "and end in view; where something is held in all images, --within LEFT,TOP,RIGHT,BOTTOM around each finger",
             [],
             still,
         )

@@ -24,6 +24,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.special import chdtri
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -36,7 +37,10 @@ from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, LONGEST_CUT_PX, STRA
 from gripmon.teach.vanishing import Outline
 
 MORE_CHI2 = 9.0
-"""Least decrease of the fit's chi-squared by which tips move on arcs, or fingers turn: three standard deviations."""
+"""Least decrease of the fit's chi-squared by which tips move on arcs: three standard deviations."""
+BY_CHANCE = 0.0027
+"""How often fingers that don't turn may seem to: three standard deviations.  Each opening has turns of its own, of
+which each explains some of the noise."""
 LEAST_TURN_RAD = math.radians(0.5)
 """Least turn that matters: at the root of a finger as long as the distance is six times as large, it is a twentieth of
 a millimetre at its tip."""
@@ -173,7 +177,8 @@ class _Fit(Jaws):
         """Why fingers turn while they move, if they do."""
         turning = self.solve(best.common, turning=True, start=best)
         turn = float(np.abs(turning.turns).max())
-        if best.chi2 - turning.chi2 > MORE_CHI2 and turn > LEAST_TURN_RAD:
+        more = np.count_nonzero(turning.free) - np.count_nonzero(best.free)
+        if best.chi2 - turning.chi2 > float(chdtri(more, BY_CHANCE)) and turn > LEAST_TURN_RAD:
             return f"the fingers turn by {math.degrees(turn):.1f} degrees while they move"
         along = self.frame(best.unknowns)[0]
         if self.placed is None and float(along @ self.rays[np.concatenate(self.tips)].mean(axis=0)) < 0.0:

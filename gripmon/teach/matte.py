@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +22,17 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.pixels import GREY_BGR
 from gripmon.model.ranks import median
 from gripmon.model.records import Array, Image
-from gripmon.model.staying import LEAST_SLOPE, WIDEST_PX, Bits, Edges, Plane, doubled, edges_that_stay, enclosed
+from gripmon.model.staying import (
+    LEAST_SLOPE,
+    STAYING_PART,
+    WIDEST_PX,
+    Bits,
+    Edges,
+    Plane,
+    doubled,
+    edges_that_stay,
+    enclosed,
+)
 from gripmon.track.edges.profiles import full_scale, quantum
 
 FEWEST_IMAGES = 5
@@ -255,7 +266,9 @@ def _inside(still: Bits) -> Bits:
 
 
 def _level(stack: Plane, inside: Bits) -> None:
-    """Adjust each image in place by a gain and an offset, so that the gripper's pixels agree with their median."""
+    """Adjust each image in place by a gain, so that the gripper's pixels agree with their median: exposure and lamps.
+    By two faces, each in a light of its own, an offset would be tens of levels off where a dark pad is.
+    """
     at = np.flatnonzero(inside)[:: max(1, np.count_nonzero(inside) // 20_000)]
     values = stack.reshape(len(stack), -1)[:, at].astype(float)
     middle = np.median(values, axis=0)
@@ -263,31 +276,19 @@ def _level(stack: Plane, inside: Bits) -> None:
     if np.count_nonzero(usable) < 50:
         return
     for k in range(len(stack)):
-        gain, offset = _gain(values[k, usable], middle[usable])
+        gain = _gain(values[k, usable], middle[usable])
         if 0.2 < gain < 5.0:
-            stack[k] = gain * stack[k] + offset
+            stack[k] *= gain
 
 
-def _gain(seen: Array, wanted: Array) -> tuple[float, float]:
-    """Robust gain and offset that adjust grey levels (p,) of an image to those of all images.
-
-    Without a spread of grey levels beyond their noise only the gain can be determined.  A slope by least squares would
-    be too small by that noise: 1 % at ten times it.
-    """
-    weight, gain, offset = np.ones(len(seen)), 1.0, 0.0
+def _gain(seen: Array, wanted: Array) -> float:
+    """Robust gain that adjusts grey levels (p,) of an image to those of all images."""
+    weight, gain = np.ones(len(seen)), 1.0
     for _ in range(6):
-        total = float(weight.sum())
-        centre = float(weight @ seen) / total, float(weight @ wanted) / total
-        spread = float(weight @ np.square(seen - centre[0])) / total
-        noise = _MAD * float(np.median(np.abs(gain * seen + offset - wanted)))
-        if spread > 100.0 * noise**2:
-            gain = float(weight @ ((seen - centre[0]) * (wanted - centre[1]))) / total / spread
-            offset = centre[1] - gain * centre[0]
-        else:
-            gain, offset = centre[1] / max(centre[0], 1.0), 0.0
-        off: Array = np.abs(gain * seen + offset - wanted)
+        gain = float(weight @ wanted) / max(float(weight @ seen), 1.0)
+        off: Array = np.abs(gain * seen - wanted)
         weight = 1.0 / np.maximum(off / max(_MAD * float(np.median(off)), 0.1), 1.0)
-    return gain, offset
+    return gain
 
 
 def _noise(off: Iterable[Plane], inside: Bits, least_noise: float) -> float:
@@ -330,15 +331,25 @@ def _directions(image: Plane) -> Plane:
 
 
 def _differ(features: Plane, one: list[int], other: list[int]) -> bool:
-    """Whether more stays in each of two sets of images than in both together."""
+    """Whether more stays in each of two sets of images than in both together.  Images of a video follow each other
+    before much the same background, which stays in a set as well: what does by chance is measured, where nothing stays
+    in both.
+    """
     if min(len(one), len(other)) < FEWEST_IMAGES:
         return False
-    least = min(_staying_energy(features[one]), _staying_energy(features[other]))
-    return least > _staying_energy(features[one + other])
+    both = [_resultant(features[own]) for own in (one, other, one + other)]
+    mean, each = both[-1]
+    changing = mean < STAYING_PART**2 * each
+    energies = []
+    for (mean, each), count in zip(both, (len(one), len(other), len(one) + len(other)), strict=True):
+        shown = changing & (each > 0.0)
+        usual = float(np.median(mean[shown] / each[shown])) if shown.any() else 0.0
+        # Random directions' squared mean is exponentially distributed, so that its median is ln 2 of its mean.
+        chance = max(usual / math.log(2.0), 1.0 / count)
+        energies.append(float(np.maximum(mean - 3.0 * chance * each, 0.0).sum()))
+    return min(energies[:2]) > energies[2]
 
 
-def _staying_energy(features: Plane) -> float:
-    """Sum of the squares of the mean directions, without what n random ones give."""
-    mean = np.square(features.mean(axis=0)).sum(axis=0)
-    each = np.square(features).sum(axis=1).mean(axis=0)
-    return float(np.maximum(mean - 3.0 * each / len(features), 0.0).sum())
+def _resultant(features: Plane) -> tuple[Plane, Plane]:
+    """Square of the mean direction (h, w) over images (n, 2, h, w), and the mean square of each one's."""
+    return np.square(features.mean(axis=0)).sum(axis=0), np.square(features).sum(axis=1).mean(axis=0)

@@ -180,7 +180,7 @@ def measure_transitions(
     upper, lower = weight[:, :, None] * d, weight * contrast
     total_upper, total_lower = upper.sum(axis=0), lower.sum(axis=0)
     usable = stations.inside & (np.sqrt(np.square(contrast).sum(axis=0)) > FEWEST_CONTRASTS * noise)
-    clear, different = backgrounds_beside(contrast, noise)
+    clear, different = backgrounds_beside(contrast, usual + light, noise)
     usable &= (clear >= FEWEST_CLEAR) & (different >= FEWEST_BACKGROUNDS)
     transition = total_upper / np.maximum(total_lower, 1e-6)[:, None]
     near = (s >= -search - 2.0) & (s <= search + 2.5)
@@ -254,18 +254,26 @@ def _changes(inner: NDArray[np.float32], near: NDArray[np.float32], far: NDArray
     )
 
 
-def backgrounds_beside(contrast: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """How many images (s,) show a clear contrast (n, s) at each station, and how many different backgrounds (s,) these
-    have: ranges of grey levels, as wide as a clear contrast is high, that hold some.
+def backgrounds_beside(contrast: Array, finger: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """How many images (s,) show a clear contrast (n, s) to the ``finger``'s grey level (n, s) at each station, and how
+    many different backgrounds (s,) these have: ranges of grey levels, as wide as a clear contrast is high, that hold
+    some.  A pad has the same grey in all images, or one that follows the finger's light, whatever its contrast does.
     """
     least = CLEAR_NOISES * max(noise, 1.0)
     clear = np.abs(contrast) > least
-    levels = np.sort(np.where(clear, contrast, np.inf), axis=0)
+    behind = contrast + finger
+    light = np.maximum(finger, 1.0) / np.maximum(np.median(finger, axis=0), 1.0)
+    different = np.minimum(*(_ranges(np.where(clear, each, np.inf), least) for each in (behind, behind / light)))
+    return np.count_nonzero(clear, axis=0), np.asarray(different, np.intp)
+
+
+def _ranges(levels: Array, width: float) -> NDArray[np.intp]:
+    """How many ranges (s,) of this width hold some of the finite levels (n, s)."""
+    levels = np.sort(levels, axis=0)
     lowest = np.where(np.isfinite(levels[0]), levels[0], 0.0)
     # Of many images the levels leave no gaps, so that their range is divided.
-    steps = np.floor((np.where(np.isfinite(levels), levels, lowest) - lowest) / least)
-    gaps = np.diff(steps, axis=0) > 0.0
-    return np.count_nonzero(clear, axis=0), np.count_nonzero(gaps, axis=0) + clear.any(axis=0)
+    steps = np.floor((np.where(np.isfinite(levels), levels, lowest) - lowest) / width)
+    return np.asarray(np.count_nonzero(np.diff(steps, axis=0) > 0.0, axis=0) + np.isfinite(levels[0]), np.intp)
 
 
 def _usual(finger: Array, within: NDArray[np.bool_]) -> Array:

@@ -79,6 +79,43 @@ class FacedFingers:
         return _seen(np.max([covered for covered, _ in self._faces], axis=0).astype(np.float32))
 
 
+class PaddedFingers(FacedFingers):
+    """Bright metal with a pad on its inner side, before rooms of which most are as dark as the pads."""
+
+    def __init__(self, seed: int, pad_dn: float = 25.0, room_dn: tuple[float, float] = (8.0, 45.0)) -> None:
+        self._pad_dn, self._room_dn = pad_dn, room_dn
+        super().__init__(seed)
+
+    def _add_finger(self, side: int, rng: np.random.Generator) -> None:
+        width, height = SIZE_PX
+        middle, wide = width / 2 - side * width * rng.uniform(0.16, 0.28), rng.uniform(34.0, 56.0)
+        top, lean = height * rng.uniform(0.45, 0.6), rng.uniform(-0.2, 0.2)
+        inner, outer = middle + side * wide / 2, middle - side * wide / 2
+
+        def part(first: float, last: float, below: float) -> NDArray[np.uint8]:
+            corners = (first, top), (last, top), (last, below), (first, below)
+            return _filled(np.array([[x + lean * (y - top), y] for x, y in corners]))
+
+        metal_dn = float(rng.uniform(150.0, 210.0))
+        pad = part(inner, inner + side * rng.uniform(14.0, 36.0), top + 0.3 * height)
+        self._faces += [(part(outer, inner, height + 40.0), metal_dn), (pad, self._pad_dn)]
+
+    def _background(self, rng: np.random.Generator) -> NDArray[np.float32]:
+        width, height = SIZE_PX
+        bright = rng.random() > 0.7
+        shade = cv2.resize(rng.normal(0.0, 3.0, (4, 5)), SIZE_PX, interpolation=cv2.INTER_CUBIC)
+        out = rng.uniform(60.0, 200.0) if bright else rng.uniform(*self._room_dn)
+        out = out + shade + cv2.GaussianBlur(rng.normal(0.0, 5.0, (height, width)), (0, 0), 1.5)
+        for _ in range(rng.integers(6, 20)):
+            at, size = rng.uniform((0, 0), SIZE_PX), rng.uniform(8.0, 110.0, 2)
+            box = cv2.boxPoints((at.tolist(), size.tolist(), float(rng.uniform(0.0, 180.0))))
+            thing = np.zeros((height, width), np.uint8)
+            cv2.fillPoly(thing, [np.rint(box).astype(np.int32)], 1)
+            level = rng.uniform(8.0, 60.0) if rng.random() < 0.7 else rng.uniform(60.0, 245.0)
+            out = np.where(thing > 0, level, out)
+        return np.asarray(np.clip(out, 2.0, 250.0), np.float32)
+
+
 def _filled(shape: Array) -> NDArray[np.uint8]:
     out = np.zeros((SIZE_PX[1] * _FINE, SIZE_PX[0] * _FINE), np.uint8)
     cv2.fillPoly(out, [np.rint((shape + 0.5) * _FINE - 0.5).astype(np.int32)], 1)

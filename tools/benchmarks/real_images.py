@@ -55,6 +55,10 @@ _VIDEO: dict[str, Any] = {
 """The configuration of ``umi_left``, which has none; of the lens what its README says."""
 
 
+_BESIDE_PLATE = ("--within", "300,560,476,715", "--within", "508,560,672,715")
+"""Where the fingers of ``umi_left`` are: no image tells them from the plate that they hold in all of them."""
+
+
 @dataclass(frozen=True)
 class Task:
     """How a set's file is made, ``options`` of the command, and what it is to reach.
@@ -77,7 +81,7 @@ def tasks(limits: dict[str, tuple[float, float]], play_m: float) -> dict[str, Ta
         "xarm": Task(("--distance", "0.24:0.005"), limits["xarm"], 14 / 24, play_m),
         "piper": Task(("--distance", "0.15:0.005", "--fingers", "1"), limits["piper"], 9 / 13, play_m),
         # Nothing says how large this gripper is.  The marks on its mounts move by up to 2 px of 346 in the video.
-        "umi_left": Task((), (0.025, math.radians(8.0)), 0.6, 2.0 / 346.0, of_distance=True, values=_VIDEO),
+        "umi_left": Task(_BESIDE_PLATE, (0.025, math.radians(8.0)), 0.6, 2.0 / 346.0, of_distance=True, values=_VIDEO),
     }
 
 
