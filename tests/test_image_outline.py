@@ -63,12 +63,13 @@ def test_an_image_is_called_blurred_only_if_it_shows_how_sharp_it_is() -> None:
 def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: float, texture_dn: float) -> None:
     """Between a finger of 40 and backgrounds of 90 to 200: darker than they are, and as they are in the mean."""
 
-    def found(rng: np.random.Generator, face_px: int, spread_dn: float = 55.0) -> bool:
+    def found(rng: np.random.Generator, face_px: int, spread_dn: float = 55.0, light: float = 0.0) -> bool:
         x, images = np.arange(60), []
         for _ in range(6):
             blots = 7.0 * cv2.GaussianBlur(rng.normal(size=(60, 60)), (0, 0), 2.0)
             back = rng.uniform(145.0 - spread_dn, 145.0 + spread_dn) + texture_dn * blots
-            image = np.where(x < 30, 40.0, np.where(x < 30 + face_px, face_dn, back))
+            lit_dn = face_dn * (1.0 + light * rng.normal()) if light else face_dn
+            image = np.where(x < 30, 40.0, np.where(x < 30 + face_px, lit_dn, back))
             images.append(cv2.GaussianBlur(image, (0, 0), 0.9) + rng.normal(size=(60, 60)))
         along = np.column_stack([np.full(30, 29.5), np.arange(15.0, 45.0)])
         stations = Stations(along, np.tile([1.0, 0.0], (30, 1)), np.ones(30, bool))
@@ -78,6 +79,7 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
     assert np.mean([found(rng, 0) for _ in range(40)]) > (0.9 if texture_dn == 0.0 else 0.7)
     for face_px in (2, 4):
         assert np.mean([found(rng, face_px) for _ in range(40)]) < 0.1
+    assert np.mean([found(rng, 10, light=0.03) for _ in range(40)]) < 0.1
     if texture_dn == 0.0:  # before one wall nothing shows
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
 

@@ -48,6 +48,8 @@ WITHIN_PX = 1.0
 """How far beside its edge an outline may be taken to be: search lines at work reach 3 px to either side."""
 RISEN = 0.75
 """Part of a contrast that shows two thirds of the blur (the normal distribution's quantile) beyond an edge."""
+WIDEST_FACE_PX = 12.0
+"""Widest face that is told from a background: 1.5 mm at 8 px/mm, a chamfer or the side of a slim finger."""
 BY_CHANCE = 0.01
 """How often grey levels of backgrounds beyond an edge may be taken for something that stays there."""
 NOT_SURE = 0.05
@@ -205,11 +207,16 @@ def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float
 
     An edge so far out would leave more than a quarter of the contrast open where this is asked.  Grey levels there are
     compared over the images with those 4.5 to 8 px out.  What stays differs in the mean (Student's t, of means along
-    the edge), or it doesn't change as the background does.  Where that hardly changes nothing shows it.  A face of 8 px
-    and more isn't told from a background that changes as little.
+    the edge), or it doesn't change as the background does.  Out there grey levels have to change by at least a quarter
+    of what they change by up to :data:`WIDEST_FACE_PX` farther out: what is lit in another way changes, too.  Where the
+    background hardly changes nothing shows it.
     """
-    s = np.arange(-_NARROW_PX, _WIDE_PX + 0.25, _STEP_PX)
+    s = np.arange(-_NARROW_PX, WIDEST_FACE_PX + _WIDE_PX + 0.25, _STEP_PX)
     profiles = _read(images, stations, s)
+    if _begins_farther_out(profiles[:, :, s >= 4.5]):
+        return False
+    s = s[s <= _WIDE_PX]
+    profiles = profiles[:, :, : len(s)]
     levels = profiles.mean(axis=1)
     begun_px = WITHIN_PX + float(ndtri(RISEN)) * blur_px
     inner, there, outer = (s >= -4.0) & (s <= -2.0), [int(np.searchsorted(s, begun_px))], s >= 4.5
@@ -222,6 +229,13 @@ def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float
     if abs(float(off.mean())) > least:
         return False
     return _follows(near, far) or _changes(*(profiles[:, :, at] for at in (inner, there, outer)))
+
+
+def _begins_farther_out(levels: NDArray[np.float32]) -> bool:
+    """Whether grey levels (n, stations, samples) change over the images by far more somewhere than in the first px."""
+    width = round((_WIDE_PX - 4.5) / _STEP_PX)
+    changes = np.convolve(levels.var(axis=0).mean(axis=0), np.full(width, 1.0 / width), "valid")
+    return bool(changes[0] < (1.0 - RISEN) ** 2 * changes.max())
 
 
 def _follows(near: Array, far: Array) -> bool:

@@ -72,7 +72,7 @@ def projected_outline(
 
 def beside(drawn: Drawn, written: Sequence[Array]) -> Beside:
     """How far they lie beside each other, at a point each pixel of either."""
-    every = _inside(_each_px(written), drawn.size_px)
+    every = points_on(written, drawn.size_px)
     own = _each_px(drawn.outline)
     to_drawn = _distances(every, [*drawn.outline, *drawn.may])
     to_written = _distances(own, written)
@@ -95,8 +95,9 @@ def _each_px(lines: Sequence[Array]) -> Array:
     return np.vstack(out)
 
 
-def _inside(points: Array, size_px: tuple[int, int]) -> Array:
-    """Those that aren't in the strip along the border."""
+def points_on(lines: Sequence[Array], size_px: tuple[int, int]) -> Array:
+    """Points (n, 2) on polylines, about a pixel apart, that aren't in the strip along the image's border."""
+    points = _each_px(lines)
     last = np.array(size_px) - 1.0 - BORDER_PX
     return np.asarray(points[((points >= BORDER_PX) & (points <= last)).all(axis=1)])
 
