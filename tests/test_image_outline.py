@@ -8,9 +8,9 @@ import pytest
 from support.changing_backgrounds import CAMERA
 
 from gripmon.model.staying import Edges
-from gripmon.teach.image_outline import _blurred, _displaced, _moved_back
+from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
-from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost, measure_transitions
+from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost
 from gripmon.teach.straight_pieces import _joined, _Line
 
 
@@ -31,7 +31,7 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     seen[0] = ((uv_px @ matrix[:, :2].T + matrix[:, 2] - uv_px) * normal).sum(axis=1)
     usable = uv_px[:, 0] > 180.0
     none = np.zeros(len(angle))
-    found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones((3, 1, 2)), *3 * (none,))
+    found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
     flat = np.zeros(shape, np.float32)
     edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
     matte = Matte(flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})
@@ -40,22 +40,6 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     inner = np.s_[20:-20, 20:-20]
     off, off_before = (np.abs(image[inner] - usual[inner]).max() for image in (back[0], turned))
     assert off < 0.1 * off_before
-
-
-def test_an_image_is_called_blurred_only_if_it_shows_how_sharp_it_is() -> None:
-    """Before a textured background of the finger's own grey a sharp image shows nothing; a blurred one before white."""
-    rng = np.random.default_rng(3)
-    told = []
-    for _ in range(20):
-        images = []
-        for back, blur_px in [*((level, 0.9) for level in (90.0, 120.0, 150.0, 180.0, 200.0, 40.0)), (220.0, 2.5)]:
-            blots = 6.0 * cv2.GaussianBlur(rng.normal(size=(900, 60)), (0, 0), 2.0)
-            image = np.where(np.arange(60) < 30, 40.0, back + blots)
-            images.append(cv2.GaussianBlur(image, (0, 0), blur_px) + rng.normal(size=(900, 60)))
-        along = np.column_stack([np.full(860, 29.5), np.arange(20.0, 880.0)])
-        stations = Stations(along, np.tile([1.0, 0.0], (860, 1)), np.ones(860, bool))
-        told.append(sorted(_blurred(measure_transitions(np.array(images, np.float32), stations, 1.0, wide=True))))
-    assert told == [[6]] * 20
 
 
 @pytest.mark.parametrize("texture_dn", [0.0, 30.0])

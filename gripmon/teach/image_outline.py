@@ -29,8 +29,6 @@ MOST_BLUR_PX = 2.5
 """Largest blur of an outline's transition: beyond it the background's edges merge with the fingers' (see Limits)."""
 LEAST_SHARPNESS = 0.6
 """Least sharpness of an image's transitions over that of all: an image blurred to 1.7 times their width has less."""
-BLUR_SIGMAS = 3.0
-"""Standard errors, by the scatter of parts along the outline, below that: 1 sharp image in 700 is called blurred."""
 LEAST_SEEN = 0.7
 """Least part of a finger's outline in view that is measured: with less, what is missing may be its tip."""
 _TURNS = 4
@@ -142,18 +140,13 @@ def _stations(contour: Array, part: Bits, near: Bits) -> Stations:
 
 
 def _blurred(found: Transitions) -> dict[int, str]:
-    """Images that show the outline blurred: why, by their index in the matte.  One whose background is nearly as bright
-    as the fingers doesn't show how sharp it is, and does no harm.
-    """
-    total = found.steepness.sum(axis=1)
-    sharp = total[:, 0] / np.maximum(total[:, 1], 1e-9)
-    least = LEAST_SHARPNESS * float(np.median(sharp))
-    less = found.steepness[:, :, 0] - least * found.steepness[:, :, 1]
-    scatter = less.std(axis=1, ddof=1) if less.shape[1] > 1 else np.full(len(less), np.inf)
-    clearly = less.sum(axis=1) < -BLUR_SIGMAS * scatter * less.shape[1] ** 0.5
+    """Images that show the outline blurred: why, by their index in the matte."""
+    least = LEAST_SHARPNESS * float(np.median(found.sharpness))
     return {
-        k: f"shows the outline {100.0 * sharp[k]:.0f} % as sharp as all images together do: it is blurred"
-        for k in np.flatnonzero(clearly).tolist()
+        k: f"shows the outline {max(100.0 * sharp, 0.0):.0f} % as sharp as the others do: it is blurred, or what is "
+        "behind is nearly as bright as the fingers"
+        for k, sharp in enumerate(found.sharpness.tolist())
+        if sharp < least
     }
 
 

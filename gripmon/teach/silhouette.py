@@ -20,7 +20,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.special import fdtri, ndtr, ndtri, stdtrit
 
 from gripmon.model.camera import Camera
@@ -79,8 +79,8 @@ class Transitions:
 
     ``offset_px`` (s,) of the edge along the normals; ``folds_px`` (f, s), the same with one f-th of the images left
     out; ``usable`` (s,); ``blur_px`` of the transition; ``shift_px`` (n, s), how much farther out an image shows the
-    edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``steepness``
-    (n, p, 2) of each image's transitions in p parts of the outline, and as all images have it; ``clear`` and
+    edge than all images do, with the relative information ``worth`` (n, s), its squared contrast; ``sharpness`` (n,) of
+    each image's transitions over that of all; ``clear`` and
     ``different`` (s,) as :func:`backgrounds_beside` has them; ``level`` (s,) of the finger, grey.
     """
 
@@ -90,7 +90,7 @@ class Transitions:
     blur_px: float
     shift_px: Array
     worth: Array
-    steepness: Array
+    sharpness: Array
     clear: NDArray[np.intp]
     different: NDArray[np.intp]
     level: Array
@@ -197,8 +197,8 @@ def measure_transitions(
         rest = np.maximum(total_lower - lower[part].sum(axis=0), 1e-6)
         without.append(((total_upper - upper[part].sum(axis=0)) / rest[:, None])[:, near])
     folds = _edge(np.concatenate(without), s[near], blur_px, search)[0].reshape(len(without), -1)
-    shift, worth, steepness = _of_each(d, contrast, s, offset, blur_px, usable)
-    return Transitions(offset, folds, usable, blur_px, shift, worth, steepness, clear, different, usual)
+    shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
+    return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
 
 
 def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
@@ -368,7 +368,7 @@ def _edge(transition: Array, s: Array, blur_px: float, search_px: float) -> tupl
 def _of_each(
     d: Array, contrast: Array, s: Array, offset: Array, blur_px: float, usable: NDArray[np.bool_]
 ) -> tuple[Array, Array, Array]:
-    """To first order: shift of the edge in each image against all, its information, and the steepness of its parts."""
+    """To first order: shift of the edge in each image against all, its information, and each image's sharpness."""
     away = (s[None] - offset[:, None]) / blur_px
     near = np.abs(away) < 2.5
     rise, slope = ndtr(away), np.where(near, np.exp(-0.5 * away**2) / (blur_px * (2.0 * np.pi) ** 0.5), 0.0)
@@ -376,14 +376,11 @@ def _of_each(
     rest = d - contrast[:, :, None] * rise[None]
     shift = -np.einsum("nij,ij->ni", rest, slope) / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3) / strength
     worth = np.where(usable[None], np.square(contrast), 0.0)
-    # The transition's slope in each image over the expected one; by backgrounds as they are along many stations, since
-    # one's texture is at the edge another than beyond it.
-    wide = uniform_filter1d(np.where(usable, contrast, 0.0), ALIKE_STATIONS, axis=1)
+    # The transition's slope in each image over the expected one.
     steep = np.gradient(d, s, axis=2)
-    own = np.einsum("nij,ij,ni->ni", steep, slope, np.where(usable, wide, 0.0))
-    expected = np.where(usable, np.square(slope).sum(axis=1) * contrast * wide, 0.0)
-    parts = np.arange(0, own.shape[1], ALIKE_STATIONS)
-    return shift, worth, np.stack([np.add.reduceat(each, parts, axis=1) for each in (own, expected)], axis=2)
+    own = np.einsum("nij,ij,ni->n", steep, slope, np.where(usable, contrast, 0.0))
+    expected = np.einsum("ij,ni->n", np.square(slope), worth)
+    return shift, worth, own / np.maximum(expected, 1e-9)
 
 
 def to_ideal_px(camera: Camera, uv_px: Array) -> Array:
