@@ -21,6 +21,7 @@ import heapq
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from gripmon.model.ranks import of_ranks
 from gripmon.model.records import Array
 
 Plane = NDArray[np.float32]
+_T = TypeVar("_T", bound=np.generic)
 Bits = NDArray[np.bool_]
 
 LEAST_SLOPE = 2.0
@@ -53,6 +55,11 @@ LEAST_CHANGING = 0.02
 CHANGE_WORTH = 0.3
 """What a boundary between a cell where everything changes and one where nothing does counts over an edge that stays in
 all images: by itself, as where a wall begins, less than :data:`STAYING_PART` asks for."""
+CLOSED_GAP_PX = 7
+"""Gaps in what stays that are closed: at a corner directions mix over the width of two blurred edges."""
+CLOSED_CHANGING = 0.2
+"""Part of what the background changes by: in what edges that stay enclose less changes, or it is background as well (in
+drawn tips and pads nothing does, between jaws that meet from half to twice as much as elsewhere)."""
 CELL_PX = 14
 """Side of a cell: its boundary is twice the shortest edge of 8 px that is measured, so that one edge divides it."""
 SHORT_PENALTY = 0.3
@@ -193,7 +200,29 @@ def enclosed(edges: Edges) -> Bits | None:
     changes &= (np.bincount(part, area, minlength=count)[part] >= CELL_PX**2) | (changing > 0.5 * most)
     total += CHANGE_WORTH * length_px * np.abs(changing[one] - changing[other])
     start = np.where(changes, 0, np.arange(count))
-    return np.asarray(_merged(one, other, total, length_px, start, edges.limit)[labels] != 0)
+    kept = np.asarray(_merged(one, other, total, length_px, start, edges.limit)[labels] != 0)
+    return _closed(kept, edges)
+
+
+def _closed(kept: Bits, edges: Edges) -> Bits:
+    """The pixels (h, w) that are ``kept``, and those that edges which stay cut off from the background together with
+    these: a tip or a pad about as grey as the walls, whose cells join these where its border is weakest.  Where nearly
+    as much changes as elsewhere it is background between what is kept.
+    """
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSED_GAP_PX, CLOSED_GAP_PX))
+    around = cv2.morphologyEx((edges.share > edges.limit).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    free = ~(around | kept)
+    count, label = cv2.connectedComponents(free.astype(np.uint8), connectivity=4)
+    # Beside an edge its own blur and its play change.
+    inner = np.where(cv2.erode(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, label, 0)
+    area = np.bincount(inner.ravel(), minlength=count)
+    changing = np.bincount(inner.ravel(), edges.changing.ravel(), minlength=count) / np.maximum(area, 1)
+    outside = 1 + int(area[1:].argmax()) if count > 1 else 0
+    filled = (area > 0) & (changing < CLOSED_CHANGING * changing[outside])
+    filled[[0, outside]] = False
+    added = filled[label]
+    beside = cv2.dilate(added.astype(np.uint8), np.ones((2 * CLOSED_GAP_PX + 1,) * 2, np.uint8)) > 0
+    return np.where(beside, _of_nearest(free | kept, kept | added), kept)
 
 
 def _cells(stays: Bits) -> NDArray[np.int64]:
@@ -208,10 +237,15 @@ def _cells(stays: Bits) -> NDArray[np.int64]:
             found, own = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
             labels[part] = own[part] + count
             count += found - 1
+    return _of_nearest(free, labels)
+
+
+def _of_nearest(free: Bits, values: NDArray[_T]) -> NDArray[_T]:
+    """The ``values`` (h, w) of ``free`` pixels, and elsewhere that of the nearest of these."""
     taken = (~free).astype(np.uint8)
     _, nearest = cv2.distanceTransformWithLabels(taken, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    table = np.zeros(int(nearest.max()) + 1, np.int64)
-    table[nearest[free]] = labels[free]
+    table = np.zeros(int(nearest.max()) + 1, values.dtype)
+    table[nearest[free]] = values[free]
     return np.asarray(table[nearest])
 
 
