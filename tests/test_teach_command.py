@@ -255,9 +255,9 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
 
 def test_what_makes_the_bound_larger_isnt_advised(rig: Path, taught: Path):
     unnamed, named, only = load_config(rig / "untaught.yaml"), load_config(rig / "config.yaml"), "only if the edges lie"
-    assert only not in "".join(written(unnamed, taught, pays=True) + written(named, taught, pays=True))
-    assert "add the line `taught:" in written(unnamed, taught, pays=False)[1].split(only)[1]
-    assert "otherwise take the line out again" in written(named, taught, pays=False)[1].split(only)[1]
+    assert only not in "".join(written(unnamed, taught, larger=False) + written(named, taught, larger=False))
+    assert "add the line `taught:" in written(unnamed, taught, larger=True)[1].split(only)[1]
+    assert "otherwise take the line out again" in written(named, taught, larger=True)[1].split(only)[1]
 
 
 @pytest.mark.parametrize(

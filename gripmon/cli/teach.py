@@ -140,8 +140,9 @@ def teach(arguments: Arguments) -> None:
     if arguments.into_config:
         config = name_taught(config, out)
     before, after = taught.kept()
-    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(before, after)]
-    print("\n".join([*lines, *written(config, out, pays=before.median_excess >= after.median_excess)]))
+    larger = before.median_excess < after.median_excess
+    lines = [*_summary(config, taught.taught), *taught.response.notes, *_kept_lines(before, after, larger=larger)]
+    print("\n".join([*lines, *written(config, out, larger=larger)]))
     arguments.save("picture", lambda: taught.picture(arguments.picture.suffix))
 
 
@@ -157,11 +158,13 @@ def _summary(config: Config, taught: Taught) -> list[str]:
     return lines
 
 
-def _kept_lines(before: Kept, after: Kept) -> list[str]:
-    """What frames like the images keep, without what was taught and with it, and what makes the bounds as large."""
+def _kept_lines(before: Kept, after: Kept, *, larger: bool) -> list[str]:
+    """What frames like the images keep, without what was taught and with it, and what makes the bounds as large;
+    ``larger``: than without it.
+    """
     lines = [f"the monitor over these images: {before.text()}", f"     with what was taught: {after.text()}"]
     lines += [f"     {text}" for text in (after.why(), after.help()) if text]
-    if before.median_excess < after.median_excess:
+    if larger:
         absolute = "it includes the reference's error now, and " if after.valid_by.value == "absolute" else ""
         lines.append(
             f"note: the bound is larger with what was taught ({absolute}an edge that moves with its background counts "
@@ -170,12 +173,12 @@ def _kept_lines(before: Kept, after: Kept) -> list[str]:
     return lines
 
 
-def written(config: Config, out: Path, *, pays: bool) -> list[str]:
-    """What was written, and what to do with it; ``pays``: the bound isn't larger with it."""
-    only = "" if pays else ", only if the edges lie elsewhere than the gripper file has them"
+def written(config: Config, out: Path, *, larger: bool) -> list[str]:
+    """What was written, and what to do with it; ``larger``: the bound is with it."""
+    only = ", only if the edges lie elsewhere than the gripper file has them" if larger else ""
     if config.taught_path is not None and config.taught_path.resolve() == out.resolve():
         named = f"next{only}: leave `taught:` in {config.path}; otherwise take the line out again"
-        return [f"written: {out}", *([] if pays else [named])]
+        return [f"written: {out}", *([named] if larger else [])]
     name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
     how = f"add the line `taught: {name}` to {config.path} (or use --into-config --force)"
     return [f"written: {out}", f"next{only}: {how}"]

@@ -33,8 +33,8 @@ from gripmon.model.ranks import of_ranks
 from gripmon.model.records import Array
 
 Plane = NDArray[np.float32]
-_T = TypeVar("_T", bound=np.generic)
 Bits = NDArray[np.bool_]
+_T = TypeVar("_T", bound=np.generic)
 
 LEAST_SLOPE = 2.0
 """Slope of an edge that counts in full, grey levels of 255 a pixel: a step of 6.5 levels, blurred to 1.3 px."""
@@ -220,6 +220,8 @@ def _closed(kept: Bits, edges: Edges) -> Bits:
     outside = 1 + int(area[1:].argmax()) if count > 1 else 0
     filled = (area > 0) & (changing < CLOSED_CHANGING * changing[outside])
     filled[[0, outside]] = False
+    if not filled.any():
+        return kept
     added = filled[label]
     beside = cv2.dilate(added.astype(np.uint8), np.ones((2 * CLOSED_GAP_PX + 1,) * 2, np.uint8)) > 0
     return np.where(beside, _of_nearest(free | kept, kept | added), kept)

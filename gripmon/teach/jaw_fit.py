@@ -24,9 +24,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import chdtri
 
 from gripmon.model.camera import Camera
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit
@@ -177,8 +177,8 @@ class _Fit(Jaws):
         """Why fingers turn while they move, if they do."""
         turning = self.solve(best.common, turning=True, start=best)
         turn = float(np.abs(turning.turns).max())
-        more = np.count_nonzero(turning.free) - np.count_nonzero(best.free)
-        if best.chi2 - turning.chi2 > float(chdtri(more, BY_CHANCE)) and turn > LEAST_TURN_RAD:
+        more = int(np.count_nonzero(turning.free) - np.count_nonzero(best.free))
+        if best.chi2 - turning.chi2 > chi_square_limit(BY_CHANCE, more) and turn > LEAST_TURN_RAD:
             return f"the fingers turn by {math.degrees(turn):.1f} degrees while they move"
         along = self.frame(best.unknowns)[0]
         if self.placed is None and float(along @ self.rays[np.concatenate(self.tips)].mean(axis=0)) < 0.0:

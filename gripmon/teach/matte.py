@@ -337,15 +337,16 @@ def _differ(features: Plane, one: list[int], other: list[int]) -> bool:
     """
     if min(len(one), len(other)) < FEWEST_IMAGES:
         return False
-    both = [_resultant(features[own]) for own in (one, other, one + other)]
-    mean, each = both[-1]
+    sets = one, other, one + other
+    shown = [_resultant(features[own]) for own in sets]
+    mean, each = shown[-1]
     changing = mean < STAYING_PART**2 * each
     energies = []
-    for (mean, each), count in zip(both, (len(one), len(other), len(one) + len(other)), strict=True):
-        shown = changing & (each > 0.0)
-        usual = float(np.median(mean[shown] / each[shown])) if shown.any() else 0.0
+    for (mean, each), own in zip(shown, sets, strict=True):
+        at = changing & (each > 0.0)
+        usual = float(np.median(mean[at] / each[at])) if at.any() else 0.0
         # Random directions' squared mean is exponentially distributed, so that its median is ln 2 of its mean.
-        chance = max(usual / math.log(2.0), 1.0 / count)
+        chance = max(usual / math.log(2.0), 1.0 / len(own))
         energies.append(float(np.maximum(mean - 3.0 * chance * each, 0.0).sum()))
     return min(energies[:2]) > energies[2]
 
