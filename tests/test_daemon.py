@@ -376,6 +376,20 @@ def test_the_interpreter_is_left_as_it_was():
     assert gc.get_freeze_count() == 0
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_real_time_priority_is_asked_for_only_where_a_configuration_does(
+    wanted: bool, caplog: pytest.LogCaptureFixture
+):
+    seen: list[int] = []
+    with caplog.at_level(logging.INFO):
+        Bench([0, lambda _: seen.append(os.sched_getscheduler(0)), 1], real_time=wanted).run()
+    said = [each for each in caplog.records if each.message.startswith("real-time priority")]
+    assert len(said) == wanted
+    given = bool(said) and said[0].levelno == logging.INFO
+    assert seen == [os.SCHED_RR if given else os.SCHED_OTHER]
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
 def test_signals_stop_the_loop_with_their_code(number: signal.Signals, code: int):
     bench = Bench([0, lambda _: signal.raise_signal(number), 1, 2, 3])

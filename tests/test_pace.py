@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import subprocess
+import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 import numpy as np
@@ -16,7 +19,7 @@ from gripmon.daemon.simulated import at_own_pace, demo_config
 from gripmon.io.sources import SimulatedSettings
 from gripmon.io.sources.realtime import SimulatedCamera
 from gripmon.model.coverage import LEAST_SHARE, too_few
-from gripmon.model.priority import NICENESS, give_way
+from gripmon.model.priority import NICENESS, give_way, real_time, stand_beside
 from gripmon.model.records import Frame
 from gripmon.monitor import warm_up
 
@@ -81,6 +84,49 @@ def test_a_thread_gives_way_alone():
     thread.join()
     assert seen == [min(before + NICENESS, 19)]
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
+
+
+def _policies() -> dict[str, tuple[int, int]]:
+    """Scheduling policy and real-time priority of each thread that Python started here."""
+    threads = [(each.name, each.native_id or 0) for each in threading.enumerate()]
+    return {name: (os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority) for name, tid in threads}
+
+
+def test_real_time_puts_the_loop_above_its_helpers_and_those_above_other_programs():
+    """The real system call; where the system doesn't allow it, it says what would."""
+    go_on, seen = threading.Event(), dict[str, tuple[int, int]]()
+    before = threading.Thread(target=go_on.wait, name="before")
+    before.start()
+    calling = threading.current_thread().name
+    try:
+        with real_time() as (given, said), ThreadPoolExecutor(1, "analysis", stand_beside) as pool:
+            pool.submit(lambda: None).result()
+            seen = _policies()
+            way = pool.submit(lambda: (give_way(), os.sched_getscheduler(threading.get_native_id()))[1]).result()
+        after = _policies()
+    finally:
+        go_on.set()
+        before.join()
+    assert {after[calling], after["before"]} == {(os.SCHED_OTHER, 0)} and way == os.SCHED_OTHER
+    if given:
+        assert said.startswith("real-time priority 2 for the loop, 1 for what works beside it; cores ")
+        assert seen[calling] == (os.SCHED_RR, 2)
+        assert seen["before"] == seen["analysis_0"] == (os.SCHED_RR, 1)
+    else:
+        assert "refused it" in said and {*seen.values()} == {(os.SCHED_OTHER, 0)}
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may become somebody without privileges")
+def test_without_the_privilege_the_log_says_what_would_be_right():
+    code = (
+        "import os, resource, gripmon.model.priority as p; resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0));"
+        "os.setgid(65534); os.setuid(65534); c = p.real_time(); print(*c.__enter__(), os.sched_getscheduler(0))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said == (
+        "False real-time priority was asked for, and the system refused it (Operation not permitted): allow priority "
+        "2, by LimitRTPRIO=2 of the service, or ulimit -r 2 0\n"
+    )
 
 
 def test_renderers_give_way():

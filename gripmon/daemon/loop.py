@@ -20,6 +20,7 @@ from gripmon.io.sources import Waiting
 from gripmon.model.coverage import too_few
 from gripmon.model.errors import in_short
 from gripmon.model.outputs import Output
+from gripmon.model.priority import stand_beside
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -69,7 +70,7 @@ class Daemon(Telling):
         self._next_command_s = self._start_s
         self._source_broke = False
         self._kept_revision: int | None = None
-        self._beside = ThreadPoolExecutor(1, "analysis")
+        self._beside = ThreadPoolExecutor(1, "analysis", stand_beside)
         self._working: Future[None] | None = None
         self._untold: list[Output] = list(self._outputs)  # of the reference
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -19,8 +20,11 @@ from gripmon.daemon.loop import Daemon
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.telling import Parts
 from gripmon.daemon.watch import DaemonSettings
+from gripmon.model.priority import real_time
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.monitor import Monitor
+
+_log = logging.getLogger(__name__)
 
 _UNHURRIED_S = 10.0  # for the recording, if no stop was requested
 _SHORTEST_CLOSE_S = 0.5
@@ -69,7 +73,7 @@ def _closing(parts: Parts, lines: Path | None) -> Iterator[tuple[Parts, Snapshot
         faults.append(lambda: keeper.failure)
         snapshots = closing.enter_context(contextlib.closing(Snapshots(parts.outlines)))
         reports = replace(parts.reports, faults=[*faults, *parts.reports.faults])
-        with _steady_interpreter():
+        with _steady_interpreter(), _prioritised(settings):
             yield replace(parts, outputs=outputs, reports=reports), snapshots
 
 
@@ -77,6 +81,17 @@ def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
     if stop.requested_s is None:
         return _UNHURRIED_S
     return max(_SHORTEST_CLOSE_S, stop.requested_s + settings.stop_within_s - time.monotonic())
+
+
+@contextlib.contextmanager
+def _prioritised(settings: DaemonSettings) -> Iterator[None]:
+    """With real-time priority where the settings ask for it; the log says what the system gave."""
+    if not settings.real_time:
+        yield
+        return
+    with real_time() as (given, said):
+        _log.log(logging.INFO if given else logging.WARNING, "%s", said)
+        yield
 
 
 @contextlib.contextmanager

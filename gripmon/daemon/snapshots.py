@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import queue
 import threading
 import time
@@ -21,6 +20,7 @@ from gripmon.daemon.neighbours import Asked
 from gripmon.io.publish.presence import CLOSE_WITHIN_S
 from gripmon.model.errors import in_short
 from gripmon.model.geometry import from_record
+from gripmon.model.priority import give_way
 from gripmon.model.records import (
     Array,
     CommandError,
@@ -41,7 +41,6 @@ LARGEST_EXACT_BYTES = 32 << 20
 _LARGEST_FILE_BYTES = 40 << 20
 _JPEG_QUALITY = 95
 _WAITING_MOST = 2
-_NICENESS = 10  # the loop has priority
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
@@ -100,8 +99,7 @@ class Snapshots:
             self._thread.join(CLOSE_WITHIN_S)
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # of this thread alone, on Linux
+        give_way()
         while (job := self._jobs.get()) is not None:
             try:
                 _complete(job, self._outlines)

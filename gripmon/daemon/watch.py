@@ -77,6 +77,13 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             "0: one file without limit (bytes)",
         ),
     ] = 10_000_000_000
+    real_time: Annotated[
+        bool,
+        msgspec.Meta(
+            description="ask the system for real-time priority, so that other programs don't delay frames; the log "
+            "says what it gave"
+        ),
+    ] = False
     stop_within_s: Annotated[
         float,
         msgspec.Meta(

@@ -14,12 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from benchmarks import harness, scene
 from benchmarks.latency_program import Plan
 from benchmarks.parts import Measured, Row
 from benchmarks.switched import SwitchedRecorder
 from gripmon.io.sources import Waiting
 from gripmon.io.sources.realtime import SimulatedCamera
+from gripmon.model import priority
 from gripmon.model.records import Frame
 
 OF_A_CORE = 12.0
@@ -54,6 +57,7 @@ class _Live(harness.RingSource):
         self._camera: SimulatedCamera | None = None
         self._begun: tuple[float, float, float] | None = None
         self.loop_s = self.process_s = self.wall_s = 0.0
+        self.dropped_at_first = 0  # before the loop's time counts
 
     @property
     def dropped(self) -> int:  # type: ignore[override]
@@ -74,7 +78,7 @@ class _Live(harness.RingSource):
         now = time.thread_time(), time.process_time(), time.monotonic()
         if self._begun is None:
             if seq >= _BEGIN_S * scene.FPS:
-                self._begun = now
+                self._begun, self.dropped_at_first = now, self.dropped
             return
         self.loop_s, self.process_s, self.wall_s = (b - a for a, b in zip(self._begun, now, strict=True))
 
@@ -95,10 +99,12 @@ class _Lived(NamedTuple):
     received: str
 
 
-def _lived(path: Path, seconds: float) -> _Lived:
+def _lived(path: Path, seconds: float, real_time: bool = False) -> _Lived:
     """A live camera at 60 frames/s, the loop with its publisher and its recording, on any core."""
     ring = scene.Ring.load(path)
     config = scene.config_for(ring.size)
+    prioritised = msgspec.structs.replace(config.settings.daemon, real_time=real_time)
+    config = dataclasses.replace(config, settings=msgspec.structs.replace(config.settings, daemon=prioritised))
     count = round((_BEGIN_S + seconds) * scene.FPS)
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
         recorder = SwitchedRecorder(config, Path(scratch))
@@ -127,24 +133,34 @@ def _never_asleep(count: int) -> Iterator[None]:
 
 
 def load(paths: tuple[Path, ...], plan: Plan) -> Measured:
-    """The daemon alone, and beside two processes that never sleep."""
+    """The daemon alone, and beside two processes that never sleep; then there with real-time priority."""
     free = _lived(paths[0], plan.load_s)
     with _never_asleep(_NEVER_ASLEEP):
-        busy = _lived(paths[0], plan.load_s)
-    most_ms, cores = max(LOADED_MS, 5.0 * free.ms["median"]), len(os.sched_getaffinity(0))
-    title = f"beside {_NEVER_ASLEEP} processes that never sleep on {cores} cores"
-    return Measured(
-        (
-            Row(f"{title}, median over the free one", busy.ms["median"] / free.ms["median"], "times", LOADED,
-                note=f"{busy.ms['median']:.3g} ms, free {free.ms['median']:.3g} ms"),
-            Row(f"{title}, 99 %", busy.ms["p99"], "ms", most_ms,
-                note=f"free {free.ms['p99']:.3g} ms; 10 ms, or 5 usual frames of a slower machine"),
-            Row(f"{title}, longest of {busy.ms['count']:,}", busy.ms["max"], "ms",
-                note=f"free {free.ms['max']:.3g} ms"),
-            Row(f"{title}, frames dropped", busy.source.dropped, "frames", 0, note=f"free {free.source.dropped}"),
-        ),
-        (f"the subscriber in another process received {busy.received}, free {free.received}",),
+        busy, first = (_lived(paths[0], plan.load_s, real_time) for real_time in (False, True))
+    title = f"beside {_NEVER_ASLEEP} processes that never sleep on {len(os.sched_getaffinity(0))} cores"
+    with priority.real_time() as (_, given):
+        got = f"real-time priority asked for: {given}"
+    rows = _beside(title, busy, free), _beside("the same with real-time priority", first, free)
+    received = f"the subscriber in another process received {busy.received}, free {free.received}"
+    return Measured(rows[0] + rows[1], (received, got))
+
+
+def _beside(title: str, busy: _Lived, free: _Lived) -> tuple[Row, ...]:
+    """A run beside others' work, against the ``free`` one."""
+    most_ms = max(LOADED_MS, 5.0 * free.ms["median"])
+    return (
+        Row(f"{title}, median over the free one", busy.ms["median"] / free.ms["median"], "times", LOADED,
+            note=f"{busy.ms['median']:.3g} ms, free {free.ms['median']:.3g} ms"),
+        Row(f"{title}, 99 %", busy.ms["p99"], "ms", most_ms,
+            note=f"free {free.ms['p99']:.3g} ms; 10 ms, or 5 usual frames of a slower machine"),
+        Row(f"{title}, longest of {busy.ms['count']:,}", busy.ms["max"], "ms", note=f"free {free.ms['max']:.3g} ms"),
+        Row(f"{title}, frames dropped after the first {_BEGIN_S:g} s", _dropped(busy), "frames", 0,
+            note=f"free {_dropped(free)}; in these {busy.source.dropped_at_first}, free {free.source.dropped_at_first}"),
     )  # fmt: skip
+
+
+def _dropped(run: _Lived) -> int:
+    return run.source.dropped - run.source.dropped_at_first
 
 
 def daemon(paths: tuple[Path, ...], plan: Plan) -> Measured:
