@@ -155,7 +155,7 @@ def _beside(title: str, busy: _Lived, free: _Lived) -> tuple[Row, ...]:
             note=f"free {free.ms['p99']:.3g} ms; 10 ms, or 5 usual frames of a slower machine"),
         Row(f"{title}, longest of {busy.ms['count']:,}", busy.ms["max"], "ms", note=f"free {free.ms['max']:.3g} ms"),
         Row(f"{title}, frames dropped after the first {_BEGIN_S:g} s", _dropped(busy), "frames", 0,
-            note=f"free {_dropped(free)}; in these {busy.source.dropped_at_first}, free {free.source.dropped_at_first}"),
+            note=f"free {_dropped(free)}; in these {busy.source.dropped_at_first} and {free.source.dropped_at_first}"),
     )  # fmt: skip
 
 
