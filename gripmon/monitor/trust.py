@@ -245,15 +245,18 @@ class Integrity:
 
     def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
         """Decide between a displaced pose and the expected place.  The proven one is published; where both or neither
-        are, the expected place, since mounts are knocked rarely.  ``at_first``: the trust in the displaced pose before
-        the strict check of its ends.
+        are, the expected place, since mounts are knocked rarely; but the bound reaches the displaced one where that
+        isn't excluded: the expected place isn't proven, or shows fewer of the edges.  ``at_first``: the trust in the
+        displaced pose before the strict check of its ends.
         """
         there = self._at_its_place(frame, now_s)
         proven = here.trust.proven
         if there is None or (proven and not there.trust.proven):
             standing = self._conclude(frame, here, now_s)
         else:
-            standing, proven = self._conclude(frame, there, now_s), there.trust.proven
+            standing = self._conclude(frame, there, now_s)
+            more = np.setdiff1d(here.measurement.normal.edge, there.measurement.normal.edge)
+            proven = there.trust.proven and not (proven and len(more))
         seen = self._weigher.confirmations(here.measurement, at_first.ends)
         if proven or seen < CORNERS_WHERE_EXPECTED:
             return standing
