@@ -36,6 +36,19 @@ def test_wild_frames_among_the_first_do_not_count(wild: int):
     np.testing.assert_allclose(baseline.error, np.full(6, 1e-4), atol=2e-6)
 
 
+@pytest.mark.parametrize("at", [5, 10, 16])
+def test_a_knock_among_the_first_frames_is_none_of_it(at: int):
+    """Nor a part of it: a mean across the knock would call the first frames wrong, and halve the knock."""
+    rng, baseline = np.random.default_rng(3), Baseline(10.0 * REFERENCE_SIGMA, 20)
+    error, knock = np.array([3e-4, 0.0, -2e-4, 1e-3, 0.0, 0.0]), np.array([1.2e-3, 1.6e-3, 0.0, 0.0, 0.0, 0.0])
+    noise = rng.normal(0.0, [2e-5] * 3 + [2e-4] * 3, (20, 6))
+    for number in range(20):
+        last = baseline.subtract(error + noise[number] + knock * (number >= at))
+    assert last is not None and baseline.error is not None
+    np.testing.assert_allclose(baseline.error, error, atol=4e-4)
+    np.testing.assert_allclose(last[:3], knock[:3], atol=8e-5)
+
+
 @pytest.mark.parametrize("axis", range(6))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_only_what_the_references_uncertainty_allows_is_its_error(axis: int, sign: float):

@@ -191,6 +191,18 @@ def test_the_error_of_a_configured_calibration_is_no_motion():
     assert only(Run(records(off_m))).affected
 
 
+def test_a_knock_among_the_first_frames_is_no_error_of_the_calibration():
+    """Nor half of one: the camera stands 1 mm away at the end, from the frame of the knock on."""
+    configured = msgspec.structs.replace(
+        REFERENCE, origin="configuration", covariance=tuple(np.diag([1e-7] * 3 + [1e-5] * 3).ravel().tolist())
+    )
+    made = records(np.where(np.arange(300)[:, None] < 10, 0.0, [0.0, 1e-3, 0.0]))
+    said(made, 13)
+    recording = only(Run(made, references=(configured,)))
+    assert recording.at_end.size_m == pytest.approx(1e-3, abs=2e-5)
+    assert recording.affected[0].start_ns == START_NS + 10 * PERIOD_NS
+
+
 def test_a_displaced_camera_of_which_no_motion_was_reported_is_not_said_to_stand():
     """As from the first frame on, or after a knock that the frames show but none of them proves."""
     summary = only(Run(records(np.tile([0.0, 3e-3, 0.0], (300, 1))))).summary

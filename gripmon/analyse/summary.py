@@ -128,6 +128,8 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
         if any(a.what == "old_calibration" for a in report.affected):
             return f"No motion of t{who} was reported ({when}), yet it was not always where its calibration has it."
         last_ns = report.last_measured_ns
+        if last_ns <= report.start_ns:
+            return f"Whether t{who} moved isn't known: it was measured once, at {clock_time(last_ns)}."
         until = "" if report.end_ns - last_ns <= SECOND_NS else f" until it was last measured, at {clock_time(last_ns)}"
         return f"T{who} did not move ({when}){until}: no motion was reported in {span(report.start_ns, last_ns)}."
     shown = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MAX_SHOWN]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from gripmon.analyse.content import Curve, Displacement
 from gripmon.analyse.vectors import to_vectors
 from gripmon.analyse.words import COVERAGE, clock_time
+from gripmon.judge.drift import Baseline
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array, ReferenceRecord
 
@@ -28,7 +29,6 @@ SECOND_NS = 1_000_000_000
 _NEAR_NS = 3600 * SECOND_NS  # from the frames: an event's own time is believed
 _LONGEST_NS = 7 * 86400 * SECOND_NS  # longest pause within one run
 _BASE_FRAMES = 20
-_ALLOWED_SIGMA = 4.0  # as the monitor's own baseline
 _PIECES = 1200
 _DETAIL_NS = 2 * SECOND_NS  # every frame is shown on either side of a motion
 _MOST_DETAIL = 2400  # frames
@@ -145,9 +145,12 @@ def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequen
         return np.zeros(6)
     if known_error is not None:
         return np.array(known_error)
-    allowed = _ALLOWED_SIGMA * np.sqrt(np.maximum(np.reshape(first.covariance, (6, 6)).diagonal(), 0.0))
-    median = np.median(shifts[:_BASE_FRAMES], axis=0)
-    return np.asarray(median) if (np.abs(median) <= allowed).all() else np.zeros(6)
+    sigma = np.sqrt(np.maximum(np.reshape(first.covariance, (6, 6)).diagonal(), 0.0))
+    begun = shifts[:_BASE_FRAMES]
+    baseline = Baseline(sigma, len(begun))  # as the monitor's own
+    for shift in begun:
+        baseline.subtract(shift)
+    return np.zeros(6) if baseline.error is None else baseline.error
 
 
 def _straightened(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[str, ...]]:

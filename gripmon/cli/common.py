@@ -253,13 +253,14 @@ def positive_number(text: str) -> float:
 def length(text: str) -> tuple[float, float]:
     """An argument M:SIGMA, a length of a wrist camera's view and its standard deviation, m."""
     value, colon, sigma = text.partition(":")
+    far = positive_number(value)
+    if far > 2.0:
+        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
     if not colon:
         raise argparse.ArgumentTypeError(
             f"'{text}' has no standard deviation; M:SIGMA in metres, e.g. {text}:0.003 for 3 mm"
         )
-    found = positive_number(value), positive_number(sigma)
-    if found[0] > 2.0:
-        raise argparse.ArgumentTypeError(f"{value} m is too far for a wrist camera (millimetres?); metres")
+    found = far, positive_number(sigma)
     if found[1] > 0.5 * found[0]:
         raise argparse.ArgumentTypeError(
             f"'{text}': the standard deviation is more than half of the length; a smaller one"

@@ -179,7 +179,7 @@ def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
     """What is wrong with the section ``jaw``, by itself and together with other sections."""
     jaw = settings.jaw
     if jaw.source != "fixed" and not gripper.has_jaw:
-        return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
+        return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "jaw.source: fixed")
     if jaw.source == "frames" and (kind := _without_jaw(settings.source)) is not None:
         return Fault("jaw.source", f"is frames, but {kind} brings no jaw opening", "fixed or zenoh")
     if jaw.source == "zenoh" and not settings.publish.enabled:

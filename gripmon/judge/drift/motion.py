@@ -23,7 +23,7 @@ class Baseline:
 
     A calibration is off by some tenths of a millimetre from the start, which is not a drift.  The mean shift of the
     first frames, outliers left out, is taken for that error if the reference's own uncertainty allows it; otherwise the
-    error is taken as zero.
+    error is taken as zero.  Of frames among which the mount was knocked those before that count.
     """
 
     def __init__(self, reference_sigma: Array, frames: int, error: Array | None = None):
@@ -42,10 +42,26 @@ class Baseline:
             self._first.append(shift)
             if len(self._first) < self._frames:
                 return None
-            mean = _mean_of_the_inner_half(np.array(self._first))
+            mean = _mean_of_the_inner_half(_before_a_step(np.array(self._first)))
             self.error = mean if (np.abs(mean) <= self._allowed).all() else np.zeros(6)
             self._first.clear()
         return shift - self.error
+
+
+def _before_a_step(shifts: Array) -> Array:
+    """The shifts (n, 6) before the clearest step among them; all where no two parts' means differ by more than twice
+    what is significant, in standard deviations of that difference: it is sought in a hundred places and axes.  Less
+    than a quarter of them before it are wild ones rather.
+    """
+    count, clearest, before = len(shifts), 2.0 * SIGNIFICANT_SIGMAS, len(shifts)
+    for k in range(max(count // 4, 2), count - 1):
+        parts = shifts[:k], shifts[k:]
+        squares = sum(np.square(part - part.mean(axis=0)).sum(axis=0) for part in parts)
+        sigma = np.sqrt(squares / (count - 2) * (1.0 / k + 1.0 / (count - k)))
+        step = (np.abs(parts[0].mean(axis=0) - parts[1].mean(axis=0)) / np.maximum(sigma, 1e-12)).max()
+        if step > clearest:
+            clearest, before = float(step), k
+    return shifts[:before]
 
 
 def _mean_of_the_inner_half(shifts: Array) -> Array:
