@@ -167,6 +167,7 @@ def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(
         (["check", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["run", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["replay", "nowhere", "--config", "{config}", "--out", "-"], "nowhere: there is no such file or folder"),
+        (["replay", "nowhere", "--out", "-"], "nowhere: there is no such file or folder"),
         (["replay", "{folder}", "--config", "{config}", "--out", "-"], "no images in"),
         (["replay", "{config}", "--config", "{config}", "--out", "-"], "can't be opened as a video"),
         (["simulate", "nonsense", "--out", "{folder}/x"], "there is no 'nonsense'; one of demo, "),
