@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.gripmon_process import GRIPMON, ROOT, start
+from support.small_disks import fill, small_disk
 
 from gripmon.cli import build_parser, main
 from gripmon.daemon.config import builtin_config, load_config
@@ -190,6 +191,19 @@ def test_other_faults_end_with_2_and_one_line(
     assert main(filled) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and said in lines[0]
+
+
+@pytest.mark.parametrize("arguments", [["static", "--seconds", "0.2"], ["plate"]])
+def test_images_that_have_no_room_are_said_in_one_line(
+    tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+):
+    with small_disk(tmp_path / "disk", 100_000) as disk:
+        out = disk / "images"
+        out.mkdir()
+        fill(disk)
+        assert main(["simulate", *arguments, "--out", str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"--out {out}: can't be written (") and line.endswith("; what is there isn't whole")
 
 
 def test_estimates_that_cannot_be_written_are_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
