@@ -171,7 +171,7 @@ def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, s
     records = [record(seq, (0.0, 0.0, 0.0)) for seq in (*range(7), 9, last)]
     records += [record(seq, (0.0, 0.0, 0.0), source=Origin.HELD) for seq in (7, 8)]  # covered by the hand
     records.sort(key=lambda each: each.seq)
-    (tmp_path / "estimates.jsonl").write_bytes(b"\n".join(map(msgspec.json.encode, records)))
+    (tmp_path / "estimates.jsonl").write_bytes(b"".join(msgspec.json.encode(each) + b"\n" for each in records))
     simulator = SimpleNamespace(truth=truth, scenario=SimpleNamespace(fps=30.0))
     summary = demo._summarise(tmp_path, simulator, 11, live=True)  # type: ignore[arg-type]
     assert summary is not None and (summary.camera_fps, summary.frames) == (30.0, 11)
