@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.gripmon_process import GRIPMON, ROOT, start
+from support.small_disks import fill, small_disk
 
 from gripmon.cli import build_parser, main
 from gripmon.daemon.config import builtin_config, load_config
@@ -167,6 +168,7 @@ def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(
         (["check", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["run", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["replay", "nowhere", "--config", "{config}", "--out", "-"], "nowhere: there is no such file or folder"),
+        (["replay", "nowhere", "--out", "-"], "nowhere: there is no such file or folder"),
         (["replay", "{folder}", "--config", "{config}", "--out", "-"], "no images in"),
         (["replay", "{config}", "--config", "{config}", "--out", "-"], "can't be opened as a video"),
         (["simulate", "nonsense", "--out", "{folder}/x"], "there is no 'nonsense'; one of demo, "),
@@ -189,6 +191,19 @@ def test_other_faults_end_with_2_and_one_line(
     assert main(filled) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and said in lines[0]
+
+
+@pytest.mark.parametrize("arguments", [["static", "--seconds", "0.2"], ["plate"]])
+def test_images_that_have_no_room_are_said_in_one_line(
+    tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+):
+    with small_disk(tmp_path / "disk", 100_000) as disk:
+        out = disk / "images"
+        out.mkdir()
+        fill(disk)
+        assert main(["simulate", *arguments, "--out", str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"--out {out}: can't be written (") and line.endswith("; what is there isn't whole")
 
 
 def test_estimates_that_cannot_be_written_are_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -17,9 +17,21 @@ import pytest
 from support.gripmon_process import gripmon
 
 from gripmon.analyse.comparison import compare
+from gripmon.cli import main
 from gripmon.daemon import simulated as demo
 from gripmon.model.geometry import from_record, make_transform, to_record
-from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.model.records import (
+    Alert,
+    AlertEvent,
+    AlertKind,
+    Cause,
+    FrameRecord,
+    Origin,
+    Severity,
+    State,
+    Verdict,
+    to_json,
+)
 from gripmon.simulate import FrameTruth
 
 
@@ -53,6 +65,23 @@ def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: py
         (other,) = demo.demo_config(4.0).settings.publish.listen
         assert other.startswith("tcp/127.0.0.1:") and other != f"tcp/127.0.0.1:{taken}"
     assert demo.demo_config(4.0).settings.publish.listen == (f"tcp/127.0.0.1:{taken}",)
+
+
+def test_without_a_line_of_estimates_it_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(demo.Demo, "run", lambda *_, **__: (0, None))
+    assert main(["demo", "--fps", "6", "--out", str(tmp_path)]) == 3
+    assert capsys.readouterr().err.endswith(f"no frame is in {tmp_path}/estimates.jsonl; the log above says why\n")
+
+
+def test_a_disk_that_fills_up_costs_a_line_and_the_file_not_the_summary(tmp_path: Path):
+    records = [record(seq, (0.0, 0.0, 0.0)) for seq in range(6)]
+    (tmp_path / "estimates.jsonl").write_bytes(b"\n".join(to_json(each) for each in records)[:-9])
+    (tmp_path / "summary.json").mkdir()
+    simulator = SimpleNamespace(truth=truth, scenario=SimpleNamespace(fps=10.0))
+    summary = demo._summarise(tmp_path, simulator, 6, live=False)
+    assert summary is not None and summary.frames == 5
 
 
 def record(seq: int, error_m: tuple[float, float, float], **changes: Any) -> FrameRecord:
@@ -142,7 +171,7 @@ def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, s
     records = [record(seq, (0.0, 0.0, 0.0)) for seq in (*range(7), 9, last)]
     records += [record(seq, (0.0, 0.0, 0.0), source=Origin.HELD) for seq in (7, 8)]  # covered by the hand
     records.sort(key=lambda each: each.seq)
-    (tmp_path / "estimates.jsonl").write_bytes(b"\n".join(map(msgspec.json.encode, records)))
+    (tmp_path / "estimates.jsonl").write_bytes(b"".join(msgspec.json.encode(each) + b"\n" for each in records))
     simulator = SimpleNamespace(truth=truth, scenario=SimpleNamespace(fps=30.0))
     summary = demo._summarise(tmp_path, simulator, 11, live=True)  # type: ignore[arg-type]
     assert summary is not None and (summary.camera_fps, summary.frames) == (30.0, 11)

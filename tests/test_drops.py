@@ -38,6 +38,16 @@ def test_a_slow_second_is_forgotten():
     assert not any(said)
 
 
+def test_a_camera_that_comes_late_is_judged_from_its_first_frame_on():
+    drops = Drops(0.2)
+    assert not any(after(drops, 30, 0, 0))  # the monitor waits
+    said = [drops.look(10 * s - 3, 3, 130.0 + s) for s in range(1, 21)]  # its first frames find the monitor not ready
+    assert not any(said)
+    assert drops.look(197, 303, 151.0) and drops.look(197, 303, 152.0)
+    said = [drops.look(197, 303, 152.0 + s) for s in range(1, 21)]  # it is gone, and with it what was wrong
+    assert said[0] and not said[-1]
+
+
 def test_it_is_over_when_they_are_few():
     drops = Drops(0.2)
     assert after(drops, 20, 10, 50)[-1]

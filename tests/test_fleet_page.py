@@ -399,6 +399,9 @@ def test_an_operators_way(
         wait_for(" first", lambda: f"{card()} .mount .first")  # the camera was knocked
         assert visitor.script("return document.querySelectorAll(arguments[0]).length", f"{card()} .move") == 6
         looks_right_at_every_width(visitor, card)
+        right = "return document.querySelector(arguments[0]).getBoundingClientRect().right"
+        left = "return document.querySelector(arguments[0]).getBoundingClientRect().left"
+        assert visitor.script(right, f"{card()} img") < visitor.script(left, f"{card()} .mount"), "seen from the robot"
         visitor.click(f"{card()} .by-hand")
         visitor.wait(lambda: not visitor.find(f"{card()} .mount").is_displayed(), "the mount to be put away")
 

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from support.loopback import ask, free_endpoint, plain_session, wait_until
 from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
+from support.router_process import plain_config, running
 
 from gripmon.cli import main
 
@@ -119,3 +120,24 @@ def test_a_driver_that_is_killed_is_missed_and_welcome_again(sequence: Path, tmp
             wait_until(lambda: state_of(endpoint)["camera_connected"] is False, "the camera to be missed")
         assert daemon.stop() == 0
         assert "Traceback" not in daemon.said()
+
+
+@pytest.mark.slow("15 s; that a session outlives its router is in the default run")
+def test_a_router_may_restart_in_the_middle(sequence: Path, tmp_path: Path):
+    """Driver and daemon are its clients.  Nobody is helped: both find it again."""
+    endpoint = free_endpoint()
+    config = network_config(sequence, f"{{mode: client, connect: [{endpoint}]}}", name="client")
+    with running(plain_config(tmp_path, endpoint), endpoint) as router, network_daemon(config, tmp_path) as daemon:
+        with feeding(sequence, endpoint, "--fps", "10") as driver:
+            wait_until(lambda: state_of(endpoint).get("frames", 0) > 5, "frames through the router")
+            router.kill()
+            daemon.await_saying("no frames: gripmon/simulated/wrist/image is silent")
+            router.start()
+            wait_until(lambda: state_of(endpoint).get("camera_connected") is True, "frames again", 60.0)
+            before = state_of(endpoint)["frames"]
+            wait_until(lambda: state_of(endpoint).get("frames", 0) > before + 5, "more of them")
+            driver.send_signal(signal.SIGINT)
+            _, said = driver.communicate(timeout=120.0)
+            assert driver.returncode == 130 and b"Traceback" not in said
+        assert daemon.stop() == 0
+        assert "Traceback" not in daemon.said() and "malformed" not in daemon.said()

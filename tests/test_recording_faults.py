@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import shutil
 import signal
 import threading
 import time
@@ -240,18 +241,15 @@ def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monk
     assert (Recorded(first).seqs(), Recorded(second).seqs()) == ([0, 1], [3])
 
 
-def test_a_directory_that_vanishes_is_reported(tmp_path: Path) -> None:
-    directory = tmp_path / "gone"
+def test_a_directory_that_vanishes_is_reported_and_made_again(tmp_path: Path) -> None:
+    directory = tmp_path / "deep" / "recordings"
     writer = recorder(directory)
     running_worker(writer)
     offer_and_wait(writer, 0, 3)
-    for path in directory.iterdir():
-        path.unlink()
-    directory.rmdir()
+    shutil.rmtree(directory.parent)
     offer(writer, 3, 3)
     wait_until(lambda: writer.failure is not None)
     assert str(directory) in str(writer.failure)
-    directory.mkdir(exist_ok=True)  # the recording makes it again, too
     wait_until(lambda: writer.failure is None)
     offer_and_wait(writer, 6, 3)
     writer.close(60.0)

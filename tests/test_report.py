@@ -17,10 +17,11 @@ from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, 
 from gripmon.analyse.build import build
 from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
-from gripmon.analyse.page import page
+from gripmon.analyse.page import _sentences, page
 from gripmon.analyse.pictures import cut_alike
 from gripmon.analyse.plots import Figure
 from gripmon.analyse.summary import paragraph
+from gripmon.analyse.words import duration
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -136,6 +137,8 @@ def test_a_creep_begins_where_it_left_its_noise_and_lasts_until_it_rests():
     assert event.onset.earliest_ns <= event.onset.stamp_ns <= event.onset.latest_ns
     assert event.moved.size_m == pytest.approx(1.2e-3, abs=1e-5)
     assert event.moved_in_s == pytest.approx(0.95 * 6.0, abs=0.2)
+    since_s = 1e-9 * (event.noticed_ns - event.onset.earliest_ns)
+    assert f"Noticed after at most {duration(since_s)}." in _sentences(event)
 
 
 def test_two_steps_of_one_alert_are_two_events():

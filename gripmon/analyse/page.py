@@ -253,7 +253,8 @@ def _sentences(event: Event) -> str:
     if onset.latest_ns > onset.earliest_ns:
         parts.append(f"It began between {clock_time(onset.earliest_ns, 3)} and {clock_time(onset.latest_ns, 3)}.")
     if event.noticed_ns is not None and event.noticed_ns > onset.stamp_ns:
-        parts.append(f"Noticed after {span(onset.stamp_ns, event.noticed_ns)}.")
+        most = "at most " if onset.latest_ns > onset.earliest_ns else ""
+        parts.append(f"Noticed after {most}{span(min(onset.earliest_ns, onset.stamp_ns), event.noticed_ns)}.")
     if event.cause != "unknown":
         parts.append(f"Cause: {cause_words(event)}.")
     if event.end_text:

@@ -197,7 +197,7 @@ def running_figure(report: RecordingReport) -> Figure:
         1e3 * np.array([getattr(s, f"latency_{which}_s") for s in slices], float) for which in ("p99", "median")
     )
     for row, y, name, colour in (
-        (2, rate, "frames/s", BLUE), (3, p99_ms, "99 %", ORANGE), (3, median_ms, "median", BLUE),
+        (2, rate, "frames/s", PURPLE), (3, p99_ms, "99 %", ORANGE), (3, median_ms, "median", BLUE),
     ):  # fmt: skip
         figure.axis(row, rangemode="tozero")
         figure.add(row, middle, y, name, showlegend=True, line={"color": colour, "shape": "hvh"})
@@ -227,6 +227,8 @@ def mountings_figure(names: Sequence[str], shift_m: Array, mountings: Any) -> Fi
     one colour per mounting.
     """
     figure = Figure(460, [(f"{axis} (mm)", 1 / 3) for axis in "xyz"], 0.05, "stretches in the episodes' order")
+    if len(mountings) <= 10:
+        figure.layout["xaxis"]["dtick"] = 1  # no half ones
     for number in np.unique(mountings).tolist():
         mine = np.flatnonzero(mountings == number)
         for row in (1, 2, 3):

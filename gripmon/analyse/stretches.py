@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gripmon.analyse.corrected import correct_table
 from gripmon.analyse.correction import ChangePoint
 from gripmon.analyse.vectors import to_vectors
+from gripmon.analyse.words import often
 from gripmon.calibrate.verify import CHANCE, HandEyeDifference, compare_hand_eye, mean_of_one_scene
 from gripmon.judge.policy import PolicySettings, past_alert_limit
 from gripmon.model.geometry import to_record
@@ -167,7 +168,7 @@ class _Episode:
         }  # fmt: skip
         # Numbers differ from frame to frame, and so does text in brackets.
         why = Counter(_NUMBER.sub("…", reason.partition(" (")[0]) for reason in self.reasons[part] if reason)
-        reasons = [f"{count} times: {reason}" for reason, count in why.most_common(3)]
+        reasons = [f"{often(count)}: {reason}" for reason, count in why.most_common(3)]
         holds = np.zeros(len(table), dtype=bool)
         if len(used):
             mean, covariance = mean_of_one_scene(list(self.poses[used]), list(table.covariance[used]))

@@ -256,8 +256,12 @@ def replay(arguments: Arguments) -> int:
             try:
                 for record in replayed.records(step):
                     write(to_json(record) + b"\n")
-            finally:
+            except NoResultError:
+                raise  # a summary of what isn't written would say that there were no frames
+            except BaseException:
                 _say(*replayed.summary())
+                raise
+            _say(*replayed.summary())
         return EXIT_DONE if replayed.usable else EXIT_FAILED
 
 

@@ -28,7 +28,7 @@ from gripmon.cli.common import (
     seed,
 )
 from gripmon.model.errors import InputError
-from gripmon.model.stopping import signals_exit
+from gripmon.model.stopping import EXIT_FAILED, signals_exit
 
 if TYPE_CHECKING:
     from gripmon.daemon.simulated import DemoSummary, Latency
@@ -185,7 +185,7 @@ _DEMO_EXAMPLES = """\
   gripmon demo --seconds 60 --out demo/
   gripmon demo --fps 25
 
-exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
+exit codes: 0 done; 2 wrong usage; 3 no usable frame, or none could be written; 130 interrupted"""
 
 
 @Command(
@@ -231,9 +231,9 @@ def demo(arguments: Arguments) -> int:
             view=arguments.view, stop=stop,
         )  # fmt: skip
     if summary is None:
-        print("demo: no frame was processed", file=sys.stderr)
-    else:
-        print(_as_text(summary, out))
+        print(f"demo: no frame is in {out / 'estimates.jsonl'}; the log above says why", file=sys.stderr)
+        return code or EXIT_FAILED
+    print(_as_text(summary, out))
     return code
 
 

@@ -234,6 +234,9 @@ def open_replay(
     first = paths[0]
     _refuse_empty_folders(paths)
     recorded = _are_recordings(paths)
+    if not recorded and not first.exists():
+        right = "a folder of images, a video, an .mcap, a rosbag, a LeRobot dataset or an .rrd"
+        raise InputError(f"{first}: there is no such file or folder; {right}")
     with contextlib.ExitStack() as opened:
         given = None if config_path is None else load_config(config_path, check_source=False)
         run = RecordedRun(paths, given, opened) if recorded else None
@@ -284,9 +287,6 @@ def _open_input(
     episode: int | None,
     warn: Callable[[str], None] = _log.warning,
 ) -> Source:
-    if not path.exists():
-        right = "a folder of images, a video, an .mcap, a rosbag, a LeRobot dataset or an .rrd"
-        raise InputError(f"{path}: there is no such file or folder; {right}")
     settings = settings_for_path(path, fps)
     if isinstance(settings, EpisodeSettings):
         settings = as_configured(settings, config, camera, episode)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import logging
 import shlex
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -90,13 +91,13 @@ def simulate_images(
     made = _scenario(scenario, config, duration_s, fps)
     with input_errors(str(scenario)):
         simulator = config.scene.simulator(made, seed)
-    _make_empty(out)
-    if scenario == "work":
-        return SimulatedImages(out, None, write_sequence(simulator, out, step))
-    config_path = out / "config.yaml"
-    shutil.copyfile(config.gripper_path, out / "gripper.yaml")
-    config_path.write_text(_config_text(config, made, seed), encoding="utf-8")
-    return SimulatedImages(out, config_path, write_sequence(simulator, out, step))
+    with _made(out):
+        if scenario == "work":
+            return SimulatedImages(out, None, write_sequence(simulator, out, step))
+        config_path = out / "config.yaml"
+        shutil.copyfile(config.gripper_path, out / "gripper.yaml")
+        config_path.write_text(_config_text(config, made, seed), encoding="utf-8")
+        return SimulatedImages(out, config_path, write_sequence(simulator, out, step))
 
 
 def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: float | None) -> Scenario:
@@ -115,16 +116,22 @@ def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: f
 def _calibration_images(
     kind: str, out: Path, config: Config, seed: int, step: Callable[[int, int], None]
 ) -> SimulatedImages:
-    _make_empty(out)
     count, done = image_count(kind), itertools.count(1)
-    with input_errors(f"simulate {kind}"):
+    with _made(out), input_errors(f"simulate {kind}"):
         write_calibration_images(kind, config.scene, out, seed, lambda: step(next(done), count))
     return SimulatedImages(out, None, count)
 
 
-def _make_empty(path: Path) -> None:
+@contextmanager
+def _made(path: Path) -> Iterator[None]:
+    """A new or empty folder, and what is written to it."""
     if any(writable_folder(path).iterdir()):
         raise InputError(f"{path}: is not empty; a new or empty folder", "out")
+    try:
+        yield
+    except OSError as error:
+        wrong = f"can't be written ({error.strerror or error}); what is there isn't whole"
+        raise InputError(f"{path}: {wrong}", "out") from None
 
 
 def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
@@ -250,7 +257,7 @@ class Demo:
         view: str | None = None,
         stop: StopRequest | None = None,
     ) -> tuple[int, DemoSummary | None]:
-        """The daemon's exit code, and the summary, which is also written to ``out``; None if no frame was processed.
+        """The daemon's exit code, and the summary, which is also written to ``out``; None without estimates of a frame.
 
         ``step`` is called for each transform that arrives, ``on_network`` when the client has joined; ``stop``: see
         :class:`gripmon.daemon.starting.RunOptions`.
@@ -317,7 +324,8 @@ def _summarise(out: Path, simulator: Simulator, received: int, *, live: bool) ->
     """Compare ``estimates.jsonl`` with the truth, and write ``summary.json``."""
     estimates = out / "estimates.jsonl"
     decode = msgspec.json.Decoder(FrameRecord).decode
-    records = [decode(line) for line in estimates.read_bytes().splitlines()] if estimates.exists() else []
+    lines = estimates.read_bytes().splitlines(keepends=True) if estimates.exists() else []
+    records = [decode(line) for line in lines if line.endswith(b"\n")]  # the last one of a full disk is cut
     if not records:
         return None
     latencies_ms = 1e-6 * np.array([record.latency_ns for record in records])
@@ -341,7 +349,10 @@ def _summarise(out: Path, simulator: Simulator, received: int, *, live: bool) ->
         comparison=compare(records, simulator.truth),
     )
     text = json.dumps(msgspec.to_builtins(summary), indent=2) + "\n"
-    (out / "summary.json").write_text(text, encoding="utf-8")
+    try:
+        (out / "summary.json").write_text(text, encoding="utf-8")
+    except OSError as error:
+        logging.getLogger(__name__).error("%s can't be written: %s", out / "summary.json", error.strerror)
     return summary
 
 

@@ -291,7 +291,8 @@ class Drops:
         if counts and now_s - counts[-1][0] < _LOOK_EVERY_S:
             return self._text
         counts.append((now_s, handled, dropped))
-        while len(counts) > 1 and now_s - counts[1][0] >= DROP_WINDOW_S:
+        # Time without a frame says nothing about rates, such as that before the camera was there.
+        while len(counts) > 1 and (now_s - counts[1][0] >= DROP_WINDOW_S or counts[1][1:] == counts[0][1:]):
             counts.popleft()
         since_s, handled_before, dropped_before = counts[0]
         elapsed_s = now_s - since_s
@@ -300,6 +301,8 @@ class Drops:
             share = lost / max(1, few + lost)
             allowed = self._allowed / 2.0 if self._text else self._allowed
             self._text = _in_words(few / elapsed_s, (few + lost) / elapsed_s, share) if share > allowed else ""
+        elif elapsed_s == 0.0:
+            self._text = ""
         return self._text
 
 
