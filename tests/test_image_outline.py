@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from support.changing_backgrounds import CAMERA
 
-from gripmon.model.staying import Edges
+from gripmon.model.staying import Edges, edges_that_stay
+from gripmon.teach.beyond import Background, is_outermost
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
-from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px, is_outermost
+from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px
 from gripmon.teach.straight_pieces import _joined, _Line
 
 
@@ -66,6 +67,25 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
     assert np.mean([found(rng, 10, light=0.03) for _ in range(40)]) < 0.1
     if texture_dn == 0.0:  # before one wall nothing shows
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
+
+
+@pytest.mark.parametrize("texture_dn", [0.0, 10.0])
+def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn: float) -> None:
+    """Beyond one half of an edge there is a plain pad, whose light changes; plain walls as well may be one."""
+    rng, images = np.random.default_rng(2), []
+    pad = np.s_[60:120, 100:130]
+    for _ in range(8):
+        blots = cv2.GaussianBlur(rng.normal(size=(200, 300)), (0, 0), 1.5)
+        image = 120.0 + texture_dn / blots.std() * blots + rng.normal(0.0, 4.0)
+        image[pad] = 120.0 + rng.normal(0.0, 3.0)
+        image[60:180, 60:100] = 50.0
+        images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
+    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
+    still[60:180, 60:100] = True
+    behind = Background.of(stack, still, edges_that_stay(list(stack)).changing)
+    for row, begins in ((65.0, texture_dn == 0.0), (130.0, True)):
+        along = np.column_stack([np.full(45, 99.5), row + np.arange(45.0)])
+        assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
 
 
 def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:

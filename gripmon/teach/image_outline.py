@@ -14,6 +14,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.model.staying import Bits, Plane
+from gripmon.teach.beyond import Background
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
@@ -228,6 +229,7 @@ def _fingers(
     chains: dict[int, list[Chain]] = {id(part): [] for part in parts.fingers}
     in_view = dict.fromkeys(chains, 0)
     along, near = [], _near(parts.rest)
+    behind = Background.of(matte.images, matte.still, matte.edges.changing)
     for part, contour in contours:
         stations = _stations(contour, part, near)
         found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
@@ -237,7 +239,7 @@ def _fingers(
         for run, closed in runs(found.usable, points):
             run = without_outliers(found.offset_px, run)
             chains[id(part)] += fit_chains(
-                camera, matte.images, matte.noise, points[run], stations.normal[run], closed, blur_px
+                camera, matte.images, matte.noise, behind, points[run], stations.normal[run], closed, blur_px
             )
         step()
     centres_px = [np.argwhere(part)[:, ::-1].mean(axis=0) for part in parts.fingers]

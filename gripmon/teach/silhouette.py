@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.special import fdtri, ndtr, ndtri, stdtrit
+from scipy.special import ndtr
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -44,20 +44,11 @@ FEWEST_CLEAR = 4
 FEWEST_BACKGROUNDS = 2
 """Least number of different backgrounds among these.  Beside a tone's border within a finger there is always the same;
 within a background the grey level on the finger's side changes, and the image isn't used there."""
-WITHIN_PX = 1.0
-"""How far beside its edge an outline may be taken to be: search lines at work reach 3 px to either side."""
-RISEN = 0.75
-"""Part of a contrast that shows two thirds of the blur (the normal distribution's quantile) beyond an edge."""
-WIDEST_FACE_PX = 12.0
-"""Widest face that is told from a background: 1.5 mm at 8 px/mm, a chamfer or the side of a slim finger."""
-BY_CHANCE = 0.01
-"""How often grey levels of backgrounds beyond an edge may be taken for something that stays there."""
-NOT_SURE = 0.05
-"""How often what follows less than half of a background's changes, by chance, may seem to follow more."""
 FROM_BORDER_PX = 6.0
 """Least distance of a search line from the image's border: two sigmas of the contour's smoothing."""
-_STEP_PX = 0.5
-_WIDE_PX, _NARROW_PX = 8.0, 5.0
+STEP_PX = 0.5
+WIDE_PX, NARROW_PX = 8.0, 5.0
+"""Step and half lengths of search lines."""
 _GRID_PX = 0.125
 _SMOOTH_PX = 3.0
 
@@ -125,7 +116,7 @@ def stations_along(contour: Array, still: NDArray[np.bool_]) -> Stations:
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     side = inner_side(contour, normal, still)
     normal = normal if float(side.sum()) < 0.0 else -normal
-    return Stations(contour, normal, lines_in_image(contour, normal, still.shape, _WIDE_PX))
+    return Stations(contour, normal, lines_in_image(contour, normal, still.shape, WIDE_PX))
 
 
 def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
@@ -143,7 +134,7 @@ def in_image(uv_px: Array, shape: tuple[int, ...], margin_px: float) -> NDArray[
 
 
 def lines_in_image(
-    uv_px: Array, normal: Array, shape: tuple[int, ...], reach_px: float = _NARROW_PX
+    uv_px: Array, normal: Array, shape: tuple[int, ...], reach_px: float = NARROW_PX
 ) -> NDArray[np.bool_]:
     """Mask (n,) of search lines that end in an image of this shape; along a finger that leaves it they reach almost to
     its border.
@@ -158,10 +149,10 @@ def measure_transitions(
     """The edge's position at each station in ``images`` (n, h, w); ``wide`` searches within 4 px, otherwise within 2 px
     and more exactly.  ``blur_px`` is estimated if None.
     """
-    reach = _WIDE_PX if wide else _NARROW_PX
+    reach = WIDE_PX if wide else NARROW_PX
     search = 4.0 if wide else 2.0
-    s = np.arange(-reach, reach + 0.25, _STEP_PX)
-    profiles = _read(images, stations, s)
+    s = np.arange(-reach, reach + 0.25, STEP_PX)
+    profiles = across(images, stations, s)
     within, beyond = s <= -search - 0.5, s >= search + 0.5
     if not wide:
         within, beyond = (s <= -2.0) & (s >= -4.0), (s >= 2.0) & (s <= 4.0)
@@ -199,73 +190,6 @@ def measure_transitions(
     folds = _edge(np.concatenate(without), s[near], blur_px, search)[0].reshape(len(without), -1)
     shift, worth, sharpness = _of_each(d, contrast, s, offset, blur_px, usable)
     return Transitions(offset, folds, usable, blur_px, shift, worth, sharpness, clear, different, usual)
-
-
-def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:
-    """Whether the background begins at an edge at these stations in ``images`` (n, h, w), and not :data:`WITHIN_PX` or
-    more beyond it: something else of the gripper, as a narrow face, may lie between, of whatever grey level.
-
-    An edge so far out would leave more than a quarter of the contrast open where this is asked.  Grey levels there are
-    compared over the images with those 4.5 to 8 px out.  What stays differs in the mean (Student's t, of means along
-    the edge), or it doesn't change as the background does.  Out there grey levels have to change by at least a quarter
-    of what they change by up to :data:`WIDEST_FACE_PX` farther out: what is lit in another way changes, too.  Where the
-    background hardly changes nothing shows it.
-    """
-    s = np.arange(-_NARROW_PX, WIDEST_FACE_PX + _WIDE_PX + 0.25, _STEP_PX)
-    profiles = _read(images, stations, s)
-    if _begins_farther_out(profiles[:, :, s >= 4.5]):
-        return False
-    s = s[s <= _WIDE_PX]
-    profiles = profiles[:, :, : len(s)]
-    levels = profiles.mean(axis=1)
-    begun_px = WITHIN_PX + float(ndtri(RISEN)) * blur_px
-    inner, there, outer = (s >= -4.0) & (s <= -2.0), [int(np.searchsorted(s, begun_px))], s >= 4.5
-    far = levels[:, outer].mean(axis=1)
-    near = np.array([np.interp(begun_px, s, own) for own in levels])
-    off = near - far
-    scatter = float(np.std(off, ddof=1)) / len(off) ** 0.5
-    contrast = float(np.sqrt(np.square(far - levels[:, inner].mean(axis=1)).mean()))
-    least = max(float(stdtrit(len(off) - 1, 1.0 - 0.5 * BY_CHANCE)) * scatter, (1.0 - RISEN) * contrast)
-    if abs(float(off.mean())) > least:
-        return False
-    return _follows(near, far) or _changes(*(profiles[:, :, at] for at in (inner, there, outer)))
-
-
-def _begins_farther_out(levels: NDArray[np.float32]) -> bool:
-    """Whether grey levels (n, stations, samples) change over the images by far more somewhere than in the first px."""
-    width = round((_WIDE_PX - 4.5) / _STEP_PX)
-    changes = np.convolve(levels.var(axis=0).mean(axis=0), np.full(width, 1.0 / width), "valid")
-    return bool(changes[0] < (1.0 - RISEN) ** 2 * changes.max())
-
-
-def _follows(near: Array, far: Array) -> bool:
-    """Whether grey levels (n,) show three quarters of the changes of others (n,), by the straight line through them,
-    and by its slope's standard error surely half.
-    """
-    change = far - far.mean()
-    changes = max(float(change @ change), 1e-9)
-    slope = float(change @ near) / changes
-    rest = near - near.mean() - slope * change
-    sigma = (float(rest @ rest) / (len(far) - 2) / changes) ** 0.5
-    return slope > RISEN and slope - float(stdtrit(len(far) - 2, 1.0 - NOT_SURE)) * sigma > 0.5
-
-
-def _changes(inner: NDArray[np.float32], near: NDArray[np.float32], far: NDArray[np.float32]) -> bool:
-    """Whether grey levels (n, stations, samples) near an edge surely change by half as much as those far out, and by
-    more than those on the finger's side, from image to image and along the edge: a texture, which near doesn't follow
-    (Fisher's F).
-    """
-    variance, dof = [], []
-    for levels in (inner, near, far):
-        off = levels - levels.mean(axis=0)
-        each = float(np.square(off).mean())
-        variance.append(each)
-        # As many places along the edge as its mean is better known than one of them.
-        dof.append((len(levels) - 1) * each / max(float(np.square(off.mean(axis=1)).mean()), 1e-9))
-    return all(
-        variance[1] > part * float(fdtri(dof[1], dof[k], 1.0 - NOT_SURE)) * variance[k]
-        for k, part in ((0, 1.0), (2, 0.25))
-    )
 
 
 def backgrounds_beside(contrast: Array, finger: Array, noise: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -319,7 +243,7 @@ def _shading(own: Array, d: Array, contrast: Array, s: Array, search_px: float) 
     return len(d) * shading / max(len(d) * shading + rest, 1e-6)
 
 
-def _read(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[np.float32]:
+def across(images: NDArray[np.float32], stations: Stations, s: Array) -> NDArray[np.float32]:
     """Grey levels (n, stations, samples)."""
     maps = [(stations.uv_px[:, k, None] + stations.normal[:, k, None] * s).astype(np.float32) for k in (0, 1)]
     return np.stack([

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
+from gripmon.teach.beyond import Background, is_outermost
 from gripmon.teach.silhouette import (
     Stations,
     from_ideal_px,
-    is_outermost,
     lines_in_image,
     measure_transitions,
     to_ideal_px,
@@ -184,6 +184,7 @@ def fit_chains(
     camera: Camera,
     images: NDArray[np.float32],
     noise: float,
+    behind: Background,
     points: Array,
     outward: Array,
     closed: bool,
@@ -199,7 +200,7 @@ def fit_chains(
 
     def measure(first: int, last: int) -> _Line | None:
         part = slice(first, last + 1)
-        return _measured(camera, images, noise, _line_through(ideal[part]), outward[part], blur_px)
+        return _measured(camera, images, noise, behind, _line_through(ideal[part]), outward[part], blur_px)
 
     spans = list(itertools.pairwise(cuts))
     measured = [(span, measure(*span)) for span in spans]
@@ -348,6 +349,7 @@ def _measured(
     camera: Camera,
     images: NDArray[np.float32],
     noise: float,
+    behind: Background,
     ends: tuple[Array, Array],
     outward: Array,
     blur_px: float,
@@ -380,7 +382,7 @@ def _measured(
     if float(at_ends.max()) > WORST_SIGMA_PX:
         return None
     stations = _stations_on(camera, *ends, outward, min(END_MARGIN_PX, 0.2 * length), images[0].shape)
-    if stations is None or not is_outermost(images, stations, blur_px):
+    if stations is None or not is_outermost(images, stations, blur_px) or not behind.begins(stations):
         return None
     rms_px = float(np.sqrt(np.square(residual).mean()))
     return _Line(line[0], line[1], normals, distances, rms_px, _shown(at, inlier, ends))
