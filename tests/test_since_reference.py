@@ -36,7 +36,18 @@ from gripmon.monitor.common import CommonError
 from gripmon.monitor.since import FIRST_FRAMES, UNSETTLED_FRAMES, AtReference, AtReferences, Opened
 from gripmon.monitor.tracker import Tracker
 from gripmon.simulate import Scenario, paper_rig
-from gripmon.simulate.scenario import Bump, Creep, FingerLook, FingerShape, JawScript, MountScript, Vibration
+from gripmon.simulate.scenario import (
+    Bump,
+    Creep,
+    FingerLook,
+    FingerShape,
+    JawScript,
+    Light,
+    LightStep,
+    MountScript,
+    Sensor,
+    Vibration,
+)
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.integrity import Cases, Separation
 
@@ -263,6 +274,26 @@ def test_a_knock_is_seen_in_the_motion():
         assert record.drift is not None and record.valid_by is ValidBy.REFERENCE
         np.testing.assert_allclose(record.drift.tcp_shift_m, KNOCK_M, atol=1e-4)
         assert record.drift.translation_m == pytest.approx(np.linalg.norm(KNOCK_M), abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.75, 0.9])
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_a_knock_during_an_exposure_shows_the_gripper_twice_and_is_not_valid_at_the_old_place(
+    share: float, times: float
+):
+    """``share`` of the light is from after it: the truth at the middle of the exposure is there, too."""
+    at_s = KNOCKED / FPS + (0.5 - share) * Sensor().exposure_time_s
+    knock = Bump(at_s=at_s - 1e-6, ring_fraction=0.0, translation_m=tuple(times * m for m in KNOCK_M))
+    run = seen(scene(mount=(knock,)))
+    assert run.records[KNOCKED - 1].verdict is Verdict.VALID
+    for record, error_m, bound_m in zip(run.records, run.error_m, run.bound_m, strict=True):
+        assert record.verdict is not Verdict.VALID or error_m < bound_m
+    assert run.records[-1].verdict is Verdict.VALID and run.error_m[-1] < 1e-4
+
+
+def test_a_lamp_that_goes_off_shows_nothing_twice():
+    lamp = Light(steps=(LightStep(at_s=(KNOCKED - 0.5) / FPS, factor=0.4),))
+    assert all(record.verdict is Verdict.VALID for record in seen(scene(light=lamp)).records[2:])
 
 
 def test_what_valid_by_names_is_what_is_published_and_judged():

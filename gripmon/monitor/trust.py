@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from gripmon.judge.inspection import sparse
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
@@ -24,11 +25,18 @@ from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Standing, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import LOOK_ODDS, Weigher
-from gripmon.track.edges import Measurement
+from gripmon.track.edges import Measurement, own_steps
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
 """Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
+
+
+FADED_RATIO, FADED_WITHIN_S = 0.7, 0.25
+"""Contrast of the edges over that in a frame before, by each frame's own light, below which an image may show two
+places: a knock in the first half of an exposure leaves the old place at most half, and what is seen across it adds to
+that.  Frames farther apart than the second have other backgrounds.
+"""
 
 
 class _Candidate(NamedTuple):
@@ -81,6 +89,7 @@ class Integrity:
         self._elsewhere = 0
         self._believed = False
         self._ends_seen = False
+        self._contrast: tuple[float, Array] | None = None  # when measured, and (e,) of the edges; zero where unseen
 
     def strips_state(self) -> StripsRecord | msgspec.UnsetType:
         """The fingers' strips for the state file; unset before they are learnt."""
@@ -169,6 +178,9 @@ class Integrity:
         if measurement.trusted:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)
+            if standing is not None and self._faded(frame, measurement, now_s):
+                why = "the mount was knocked during the exposure: the edges have lost half of their contrast at once"
+                standing = replace(standing, bounds=unbounded(self._policy.integrity_risk, why), believed=False)
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
@@ -181,6 +193,19 @@ class Integrity:
         if standing is not None:
             self.since.weighed = first
         return standing
+
+    def _faded(self, frame: Frame, measurement: Measurement, now_s: float) -> bool:
+        """Whether most of the edges have lost contrast since the last frame measured, in proportion to the light: a
+        knock during an exposure shows the gripper twice, and where it was expected it is found.
+        """
+        assert frame.image is not None
+        seen, before = measurement.consensus.edge_seen, self._contrast
+        contrast = np.where(seen, np.abs(own_steps(measurement)), 0.0) / float(sparse(frame.image).mean())
+        self._contrast = now_s, contrast
+        if before is None or now_s - before[0] > FADED_WITHIN_S:
+            return False
+        both = (contrast > 0.0) & (before[1] > 0.0)
+        return bool(both.any() and np.median(contrast[both] / before[1][both]) < FADED_RATIO)
 
     def _past_limit(self, both: Bounds) -> bool:
         """Whether the bound that makes a transform valid is past an alert limit."""

@@ -1,6 +1,6 @@
 """Fingertip corners from images: predicted edges, sub-pixel edgel hypotheses, one joint fit, intersections."""
 
-from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends
+from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen, edges_at_ends, own_steps
 from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers, edge_residuals_px
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
 from gripmon.track.edges.readout import edge_sums, trace_of
@@ -35,6 +35,7 @@ __all__ = [
     "edges_at_ends",
     "has_lone_end",
     "inner_edges",
+    "own_steps",
     "prior_information",
     "sides",
     "trace_of",

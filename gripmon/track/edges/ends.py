@@ -215,7 +215,7 @@ class FingerEnds:
         maps = probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:]
         profiles = read_profiles(image, *maps, self._settings.response)
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
-        step = _own_steps(measurement)[prediction.layout.edge[probes.sample]]
+        step = own_steps(measurement)[prediction.layout.edge[probes.sample]]
         of = found.sample // len(PROBES_PX)
         near = np.abs(found.offset_px) < CONTINUATION_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
@@ -336,8 +336,8 @@ def _of_corners(value: NDArray[np.bool_], places: _Places) -> NDArray[np.bool_]:
     return np.append(value, False)[places.corner]
 
 
-def _own_steps(measurement: Measurement) -> Array:
-    """(e,) mean step of each edge's agreed points; zero where there are none."""
+def own_steps(measurement: Measurement) -> Array:
+    """(e,) mean step of each edge's agreed points, grey levels; zero where there are none."""
     weight, candidates = measurement.consensus.weight, measurement.candidates
     edges = len(measurement.prediction.line_origin)
     edge = measurement.prediction.layout.edge[candidates.sample]
