@@ -24,6 +24,7 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.measure import teach
 from gripmon.teach.views import TeachingImage
 from gripmon.teach.visibility import Rig
@@ -128,3 +129,17 @@ def test_a_pointed_tip_beside_a_corner_that_cannot_be_measured_is_an_end(number:
     meter = FingertipMeter(camera, gripper, SETTINGS, 5e-5)
     found = meter.measure(image(number), truth(number), OPENING_M, 0.6, Patience(False, False))
     assert found.trusted and meter.ends(image(number), found).at_each
+
+
+def test_images_at_two_openings_make_the_gripper_with_its_distance():
+    """Though at the wider of them a bracket shows that the narrower one hides: outlines of that one don't move."""
+    rows = list(csv.DictReader((DATA / "teach" / "timestamps.csv").open()))
+    kept = yaml.safe_load((DATA / "hand_eye.yaml").read_text())
+    made = gripper_from_images(
+        [DATA / "teach" / row["file"] for row in rows],
+        msgspec.convert(kept["camera"], BrownConradyLens),
+        openings_m=[float(row["jaw_opening_m"]) for row in rows],
+    )
+    assert made.gripper.has_jaw and made.response == "srgb"
+    true_m, sigma_m = kept["cam_T_grip"]["translation_m"][2], float(np.sqrt(made.covariance[2, 2]))
+    assert abs(made.cam_T_grip[2, 3] - true_m) < 2.0 * sigma_m < 4e-3

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import make_transform
 from gripmon.model.gripper import Gripper, GripperError
@@ -34,8 +34,9 @@ from gripmon.teach.image_motion import SAME_OPENING_M
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
 from gripmon.teach.matte import FEWEST_IMAGES, STRONG_BLOCKS, blocks, grey_levels, image_sets, smallest_noise
-from gripmon.teach.motion_depth import move
+from gripmon.teach.motion_depth import Moved, move
 from gripmon.teach.result import GripperResult
+from gripmon.teach.vanishing import Outline
 
 MOST_IMAGES = 200
 WORST_OUTLINE_PX = 1.0
@@ -118,17 +119,13 @@ def gripper_from_images(
     notes += [hint] if hint else []
     with progress(None, "step") as step:
         see = partial(see_opening, made, least_noise=least, step=step, fingers=fingers, within=within)
-        seen, around = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out, hint)
-        outlines = finger_outlines(made, seen)
+        every = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out, hint)
         pose = None if reference is None else reference[0]
-        at = None if pose is None else (pose[:3, :3], pose[:3, 3] / pose[2, 3])
-        travel = None if reference is None or openings_m is None else travel_of(reference, groups)
-        placed = place(outlines, *(at or (None, None)))
-        placed, motion = move(made, outlines, seen, around, placed, pose=at, travel=travel, notes=notes)
+        first, seen, around, outlines, placed, motion, more = _in_space(made, every, reference, openings_m is not None)
+        notes += more
         step()
     if openings_m is None and around:
         motion.check_opened([len(own) for own in groups.values()])
-    first = next(iter(groups))
     opening_m = first if openings_m is not None else None
     by_openings, why = depth_by_openings(motion, opening_m)
     size = size_of(placed, made.fx_px, distance_m, finger_width_m, reference, by_openings, notes)
@@ -185,7 +182,7 @@ def _see_openings(
     notes: list[str],
     left_out: dict[str, str],
     hint: str,
-) -> tuple[OpeningSeen, dict[float, OpeningSeen]]:
+) -> dict[float, OpeningSeen]:
     """What the images of the first opening show, and of each other opening with enough images; adds to ``notes`` and
     ``left_out``.  ``hint``: what refusals end with.
     """
@@ -204,10 +201,50 @@ def _see_openings(
                 refused.args = (f"{of}; of them {refused}",)
             raise
         left_out.update({files[own[k]]: why for k, why in seen[opening].left_out.items()})
-    first, *others = seen
-    if seen[first].rest.any():
+    if next(iter(seen.values())).rest.any():
         notes.append("what joins the fingers, or stays elsewhere in the image, isn't used")
-    return seen[first], {opening: seen[opening] for opening in others}
+    return seen
+
+
+class _InSpace(NamedTuple):
+    """The outlines that the images of the ``first`` opening show, where they are up to scale, and how they move to the
+    openings ``around``; ``notes`` on that.
+    """
+
+    first: float
+    seen: OpeningSeen
+    around: Mapping[float, OpeningSeen]
+    outlines: list[Outline]
+    placed: PlacedOutlines
+    motion: Moved
+    notes: list[str]
+
+
+def _in_space(
+    camera: Camera, every: Mapping[float, OpeningSeen], reference: Pose | None, in_metres: bool
+) -> _InSpace:
+    """Outlines of the first opening, whose motion to the ``every`` other shows; where it doesn't, of the first one with
+    such a motion: what fingers hide of each other, or of a palm, differs.  Unknown openings have one order only.
+    """
+    found: _InSpace | None = None
+    at = None if reference is None else (reference[0][:3, :3], reference[0][:3, 3] / reference[0][2, 3])
+    for first, seen in every.items():
+        notes, around = list[str](), {opening: other for opening, other in every.items() if opening != first}
+        travel = None if reference is None or not in_metres else travel_of(reference, [first, *around])
+        try:
+            outlines = finger_outlines(camera, seen)
+            placed = place(outlines, *(at or (None, None)))
+            placed, motion = move(camera, outlines, seen, around, placed, pose=at, travel=travel, notes=notes)
+        except NoResultError:
+            if found is None:
+                raise
+            continue
+        now = _InSpace(first, seen, around, outlines, placed, motion, notes)
+        if motion.by_opening or not in_metres:
+            return now
+        found = found or now
+    assert found is not None
+    return found
 
 
 def _compressed(images: Sequence[Image]) -> str:

@@ -235,7 +235,8 @@ class FingerStrips:
         strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -self._most, self._most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
-        least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
+        # Where the strips leave the image nothing would differ; sums by Fourier transforms may be less than nothing.
+        least = max(0.25 * float(energy[REACH_PX]), 0.0)
         return np.asarray(product / np.sqrt(np.maximum(energy, least) * self._own + 1e-12))
 
     def _know_farther(self) -> None:
