@@ -205,7 +205,8 @@ class Integrity:
         if before is None or now_s - before[0] > FADED_WITHIN_S:
             return False
         both = (contrast > 0.0) & (before[1] > 0.0)
-        return bool(both.any() and np.median(contrast[both] / before[1][both]) < FADED_RATIO)
+        faded = contrast[both] < FADED_RATIO * before[1][both]
+        return bool(2 * np.count_nonzero(faded) > len(faded))
 
     def _past_limit(self, both: Bounds) -> bool:
         """Whether the bound that makes a transform valid is past an alert limit."""
