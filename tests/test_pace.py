@@ -86,9 +86,9 @@ def test_a_thread_gives_way_alone():
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
 
 
-def _policies() -> dict[str, tuple[int, int]]:
-    """Scheduling policy and real-time priority of each thread that Python started here."""
-    threads = [(each.name, each.native_id or 0) for each in threading.enumerate()]
+def _policies(*names: str) -> dict[str, tuple[int, int]]:
+    """Scheduling policy and real-time priority of threads; others may end meanwhile."""
+    threads = [(each.name, each.native_id or 0) for each in threading.enumerate() if each.name in names]
     return {name: (os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority) for name, tid in threads}
 
 
@@ -101,9 +101,9 @@ def test_real_time_puts_the_loop_above_its_helpers_and_those_above_other_program
     try:
         with real_time() as (given, said), ThreadPoolExecutor(1, "analysis", stand_beside) as pool:
             pool.submit(lambda: None).result()
-            seen = _policies()
+            seen = _policies(calling, "before", "analysis_0")
             way = pool.submit(lambda: (give_way(), os.sched_getscheduler(threading.get_native_id()))[1]).result()
-        after = _policies()
+        after = _policies(calling, "before")
     finally:
         go_on.set()
         before.join()
