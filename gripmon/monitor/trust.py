@@ -179,7 +179,7 @@ class Integrity:
             measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
             standing: Standing | None = self._judge(frame, measurement, now_s)
             if standing is not None and self._faded(frame, measurement, now_s):
-                why = "the mount was knocked during the exposure: the edges have lost half of their contrast at once"
+                why = "the mount was knocked during the exposure: most edges have lost contrast at once"
                 standing = replace(standing, bounds=unbounded(self._policy.integrity_risk, why), believed=False)
         else:
             standing = self._held(frame, now_s)

@@ -122,6 +122,8 @@ def gripper_from_images(
         every = _see_openings(see, grey, groups, [file for file, _ in taken], notes, left_out, hint)
         pose = None if reference is None else reference[0]
         first, seen, around, outlines, placed, motion, more = _in_space(made, every, reference, openings_m is not None)
+        if seen.rest.any():
+            notes.append("what joins the fingers, or stays elsewhere in the image, isn't used")
         notes += more
         step()
     if openings_m is None and around:
@@ -201,8 +203,6 @@ def _see_openings(
                 refused.args = (f"{of}; of them {refused}",)
             raise
         left_out.update({files[own[k]]: why for k, why in seen[opening].left_out.items()})
-    if next(iter(seen.values())).rest.any():
-        notes.append("what joins the fingers, or stays elsewhere in the image, isn't used")
     return seen
 
 
@@ -223,8 +223,8 @@ class _InSpace(NamedTuple):
 def _in_space(
     camera: Camera, every: Mapping[float, OpeningSeen], reference: Pose | None, in_metres: bool
 ) -> _InSpace:
-    """Outlines of the first opening, whose motion to the ``every`` other shows; where it doesn't, of the first one with
-    such a motion: what fingers hide of each other, or of a palm, differs.  Unknown openings have one order only.
+    """Of ``every`` opening the first whose outlines are seen to move to the others, since what fingers hide of each
+    other, or of a palm, differs; the first one where none is, and of openings that nobody told (not ``in_metres``).
     """
     found: _InSpace | None = None
     at = None if reference is None else (reference[0][:3, :3], reference[0][:3, 3] / reference[0][2, 3])
