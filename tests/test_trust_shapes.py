@@ -295,6 +295,18 @@ def test_what_looks_like_a_lone_fingers_end_elsewhere_is_not_valid(condition: st
 
 
 @pytest.mark.usefixtures("tools_importable")
+def test_what_hides_a_finger_is_not_its_edge():
+    """The mount is knocked along the fingers while a printed box hides one: nothing is found, but where the gripper was
+    the other finger's sides still fit, and a third of a hidden side in the print fixes the way along.
+    """
+    from benchmarks.integrity_runs import run_scene
+
+    seen = run_scene("bump, tips hidden", 20261129, 13, 96)
+    frames = [k for k, valid in enumerate(seen["valid"]) if valid]
+    assert len(frames) > 40 and all(seen["error_m"][k] <= seen["level_m"][k] for k in frames)
+
+
+@pytest.mark.usefixtures("tools_importable")
 def test_a_bar_flush_with_the_tips_hides_no_knock(tmp_path: Path):
     """Its border goes on beside one finger and makes a corner with the other, where the ends were before the camera was
     knocked by 4 mm along the fingers; the background stands still.

@@ -290,13 +290,15 @@ class Integrity:
 
     def _held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: the measurement at the anchor.  None without an anchor, where
-        too little is seen there, or where the bound is past an alert limit.
+        too little is seen there, where neither the fingers' ends nor their strips show it, since what hides them may
+        look like edges of theirs, or where the bound is past an alert limit.
         """
         there = None if not self._weigher.proved else self._at_its_place(frame, now_s)
         if there is None:
             return None
         standing = self._conclude(frame, there, now_s)
-        return None if self._past_limit(standing.bounds) else standing
+        unknown = standing.unproven and not there.along.here
+        return None if unknown or self._past_limit(standing.bounds) else standing
 
     def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
         """The measurement at the expected place, if the gripper may still be there: marks on the fingers and borders

@@ -143,6 +143,13 @@ def bump(draft: SceneDraft) -> Changes:
     return {"mount": (Bump(at_s=at_s, ring_fraction=ring, tcp_shift_m=shift),)}
 
 
+def bump_exposed(draft: SceneDraft) -> Changes:
+    """The same during the exposure of an image, which shows the gripper twice; the truth is that of its middle."""
+    (knock,) = bump(draft)["mount"]
+    middle_s = round(knock.at_s * draft.fps) / draft.fps
+    return {"mount": (with_(knock, at_s=middle_s + draft.uniform(-0.5, 0.5) * draft.sensor.exposure_time_s),)}
+
+
 def bent(draft: SceneDraft, share: float = 0.1, times: float = 1.0) -> Changes:
     shift = [times * draft.sign() * draft.uniform(2e-4, 1.5e-3) for _ in "xy"] + [0.0]
     finger = draft.one_of(*draft.gripper.finger_ids)
@@ -217,6 +224,7 @@ ORDINARY: tuple[Condition, ...] = (
     Condition("sheet", "a printed sheet passes, up to all of the view", _cover("sheet", 0.3, 1.0)),
     Condition("covered run", "some frames show nothing of the gripper", covered_run),
     Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, wrong=MOVED, inside=False),
+    Condition("bump exposed", "the same within an exposure", bump_exposed, wrong=MOVED, inside=False),
     Condition("flash", "far too bright, or dark, for some frames", flash),
     Condition("low contrast", "fingers and table of nearly the same grey", low_contrast, enough=False),
     Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, wrong=MOVED),
