@@ -80,6 +80,8 @@ def test_each_frame_has_the_transform_of_its_stretch(tmp_path: Path, monkeypatch
     ((dataset, added, how),) = calls
     assert dataset.root == tmp_path / "arm" and how["output_dir"] == tmp_path / "copy"
     poses, flags = added[POSE][0], added[FLAG][0]
+    assert poses.ndim == flags.ndim == 1, "pandas takes no column of two dimensions"
+    poses = np.stack(list(poses))
     assert flags.tolist() == [1, 0, 1, 0, 1, 1] + [1, 0, 1, 0, 0, 0] + [0] * 6
     np.testing.assert_allclose(poses[:6], [FIRST] * 3 + [LAST] * 3, atol=1e-8)
     assert (poses[12:] == 0.0).all()

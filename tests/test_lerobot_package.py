@@ -105,7 +105,7 @@ def test_datasets_of_lerobot_get_columns_that_it_reads(tmp_path: Path):
     assert done.returncode == 0, done.stderr[-3000:]
     assert hashes_of(original) == hashes, "originals are never touched"
     found = in_lerobot("shown", root=str(copy))
-    assert found["flag"] == [1, 1, 1, 0, 1, 1] + [0] * 6 and found["episode"] == [0] * 6 + [1] * 6
+    assert found["flag"] == [1, 0, 1, 0, 1, 1] + [0] * 6 and found["episode"] == [0] * 6 + [1] * 6
     np.testing.assert_allclose(found["pose"][:6], [FIRST] * 3 + [LAST] * 3, atol=1e-7)
     step = {"robot": "arm", "camera": "wrist", "connect": [free_endpoint()]}
     refused = in_lerobot("evaluate", root=str(original), step=step, mm=1.0, deg=1.0)["refused"]

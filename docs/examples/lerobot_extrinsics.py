@@ -67,12 +67,23 @@ def columns(
     return features
 
 
+def _one_each(values: np.ndarray) -> np.ndarray:
+    """The values of the frames (n,), each a number or an array: pandas takes no column of two dimensions."""
+    if values.ndim == 1:
+        return values
+    rows = np.empty(len(values), object)
+    for number, row in enumerate(values):
+        rows[number] = row
+    return rows
+
+
 def main(root: Path, stretches: Path, copy: Path, below: str = "") -> None:
     """Make the copy."""
     dataset = LeRobotDataset("local/original", root=root)
     frames = dataset.hf_dataset.with_format("numpy").select_columns(["episode_index", "timestamp"])[:]
     added = columns(stretches, np.ravel(frames["episode_index"]), np.ravel(frames["timestamp"]), below)
-    add_features(dataset, added, output_dir=copy, repo_id="local/with_extrinsics")
+    taken = {name: (_one_each(values), about) for name, (values, about) in added.items()}
+    add_features(dataset, taken, output_dir=copy, repo_id="local/with_extrinsics")
     for name, (values, _) in added.items():
         if values.ndim == 1:
             print(f"{name}: 1 in {int(values.sum())} of {len(values)} frames")
