@@ -97,6 +97,25 @@ def test_a_jaw_that_moves_without_a_report_is_noticed_and_what_was_learnt_is_dro
     assert np.abs(errors_m[40:]).max() < 5.0 * IMAGE_SIGMA_M
 
 
+def test_what_an_object_between_the_fingers_looks_like_is_not_learnt():
+    """It is held for 30 frames, and its border looks like another opening; then the fingers open again."""
+    rng, knowledge = np.random.default_rng(6), JawKnowledge(SIGMA_M, OFFSET_SIGMA_M)
+    run(knowledge, rng, [0.034] * 40, [0.0341] * 40)
+    _, held, _ = run(knowledge, rng, [0.0346] * 30, [0.0341] * 30)
+    assert min(f.known_sigma_m for f in held) == pytest.approx(knowledge.report_sigma_m), "and nothing is known of it"
+    _, out, errors_m = run(knowledge, rng, [0.034] * 10, [0.0341] * 10)
+    assert max(f.known_sigma_m for f in out) < IMAGE_SIGMA_M and np.abs(errors_m).max() < IMAGE_SIGMA_M
+
+
+def test_what_goes_on_contradicting_where_the_jaw_is_elsewhere_replaces_what_was_learnt():
+    """The encoder was set to zero elsewhere: the offset is another one from then on."""
+    rng, knowledge = np.random.default_rng(7), JawKnowledge(SIGMA_M, OFFSET_SIGMA_M)
+    run(knowledge, rng, [0.034] * 40, [0.0341] * 40)
+    run(knowledge, rng, [0.034] * 10, [0.0346] * 10)
+    _, out, _ = run(knowledge, rng, [0.030] * 40, [0.0306] * 40)
+    assert out[-1].known_sigma_m < IMAGE_SIGMA_M and out[-1].known_m == pytest.approx(0.030, abs=2.0 * IMAGE_SIGMA_M)
+
+
 def test_an_exact_report_leaves_everything_as_it_is():
     covariance = np.diag([1e-12] * 7)
     out = JawKnowledge(0.0, OFFSET_SIGMA_M).fuse(0.034, 0.0340001, covariance)

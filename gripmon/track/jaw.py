@@ -18,6 +18,11 @@ from gripmon.model.records import Array
 UNREPORTED_MOTION_SIGMAS = 5.0
 """Standard deviations between what is known and what an image shows past which the jaw has moved without a report."""
 
+FORGOTTEN = 1e-3
+"""What a way of the jaw has left of the part of the report's error that changes, from which it counts as another place:
+what is held between the fingers is at one, and the offset at all.
+"""
+
 SYSTEMATIC_M = 2e-6
 """What no number of images tells about the opening: a fiftieth of a pixel at 100 µm a pixel."""
 
@@ -89,6 +94,7 @@ class JawKnowledge:
         self._reported_m: float | None = None
         self._alike = AlikeErrors()
         self._seen: tuple[float, float] | None = None
+        self._doubted_m: float | None = None  # the report since which images contradict what is known
         self._forget()
 
     @property
@@ -148,9 +154,12 @@ class JawKnowledge:
         self._mean = np.zeros(2)
         self._covariance = np.diag([self._offset_sigma_m**2, self._sigma_m**2])
 
+    def _left(self, way_m: float) -> float:
+        return math.exp(-abs(way_m) / (2.0 * self._sigma_m))
+
     def _travel(self, reported_m: float) -> None:
         if self._reported_m is not None and not self.exact:
-            kept = math.exp(-abs(reported_m - self._reported_m) / (2.0 * self._sigma_m))
+            kept = self._left(reported_m - self._reported_m)
             keep = np.array([1.0, kept])
             self._mean *= keep
             self._covariance *= np.outer(keep, keep)
@@ -161,11 +170,18 @@ class JawKnowledge:
         """Believe what an estimate showed of the report's error: a Kalman update.
 
         Images err alike while the background stands still: how much less than independent ones their errors differ from
-        one to the next tells how many of them count as one.
+        one to the next tells how many of them count as one.  What contradicts what is known is more probably an edge of
+        something held between the fingers than a jaw that moved without a report: it isn't learnt before the jaw is
+        elsewhere and it still does, and then instead of all before.
         """
         error_m, variance, contradicted = seen
-        if contradicted:
+        if contradicted and self._reported_m is not None:
+            if self._doubted_m is None:
+                self._doubted_m = self._reported_m
+            if self._left(self._reported_m - self._doubted_m) > FORGOTTEN:
+                return
             self._forget()
+        self._doubted_m = None
         if self._seen is not None:
             before_m, before = self._seen
             self._alike.learn((error_m - before_m) ** 2 / (variance + before))
