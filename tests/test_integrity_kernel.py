@@ -11,10 +11,11 @@ from support.by_numpy import integrity as by_numpy
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
-from gripmon.monitor import Monitor
+from gripmon.monitor import Monitor, weigher
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.track.integrity import Cases, Doubts, Separation, kernel, level_kernel, separation
+from gripmon.track.integrity import Cases, Doubts, Separation, frame_kernel, kernel, level_kernel, separation
+from gripmon.track.integrity.frame_kernel import NOTHING_BARE, NOTHING_LASTS
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
@@ -77,12 +78,6 @@ def test_fits_are_those_of_numpy(m: int, seed: int):
     anchor = shifts(rng, 1)[0], covariances(rng, 1)[0]
     for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
         agree(kernel.with_pose(*sums, *anchor, off), by_numpy.with_pose(*sums, *anchor, off), 1.0 / SIZE)
-        one, other = (by.with_and_without(*of, *anchor, off, 1.44, True) for by in (kernel, by_numpy))
-        for found, expected in zip(one[:2], other[:2], strict=True):
-            agree(found, expected)
-        alone, none, squares = kernel.with_and_without(*of, *anchor, off, 1.44, False)
-        assert all(map(np.array_equal, (*alone, squares), (*one[0], one[2]))) and not any(map(len, none))
-        np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -116,6 +111,8 @@ def test_a_frames_refits_are_those_of_numpy(m: int):
     for found, numpys in zip(one[2:], other[2:], strict=True):
         agree(found, numpys)
     np.testing.assert_allclose(squares, expected, rtol=1e-8)
+    *_, alone, none, same = kernel.refitted(*of, 1.44, False)
+    assert all(map(np.array_equal, (*alone, same), (*one[2], squares))) and not any(map(len, none))
 
 
 def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -166,9 +163,9 @@ def test_jumps_are_those_of_numpy(seed: int):
         after = *frame, at, known, off, jumps, fit, jump, rng.uniform(size=9), 0.5
         agree(kernel.after_jumps(*after), by_numpy.after_jumps(*after))
         share, along = np.array([0.4, 0.3, 0.2, 0.1]), np.array([False, False, True, True])
-        weights, endless = 10.0 ** rng.uniform(-4.0, 0.0, (2, HYPOTHESES)), rng.uniform(size=HYPOTHESES) < 0.5
-        weights[0, 2] = 0.0
-        of = *frame, at, known, off, jumps, share, along, *weights, stays, endless, 1e-3, 1.44
+        weight, endless = 10.0 ** rng.uniform(-4.0, 0.0, HYPOTHESES), rng.uniform(size=HYPOTHESES) < 0.5
+        weight[2] = 0.0
+        of = *frame, at, known, off, jumps, share, along, weight, 0.01, 0.3, stays, endless, 1e-3, 1.44
         (fit, jump, weight, left), (fits_, jumps_, expected, rest) = kernel.knocked(*of), by_numpy.knocked(*of)
         assert 0 < len(fit) < 4 * HYPOTHESES and fit.tolist() == fits_.tolist() and jump.tolist() == jumps_.tolist()
         np.testing.assert_allclose(np.append(weight, left), np.append(expected, rest), rtol=1e-8)
@@ -235,11 +232,8 @@ def test_what_has_no_root_is_inverted_all_the_same():
     of = *average, none, none, *Separation(frame.shift, 1e3 * frame.covariance, frame.of_model), rows, 12.0
     agree(kernel.telling(*of), by_numpy.telling(*of))
     anchor = shifts(rng, 1)[0], -covariances(rng, 1)[0], of_the_model(rng, 1)[0]
-    of = *normal_equations(rng, 7), *anchor, 1.0, True
-    one, other = kernel.with_and_without(*of), by_numpy.with_and_without(*of)
-    for found, expected in zip(one[:2], other[:2], strict=True):
-        agree(found, expected)
-    np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
+    of = *by_numpy.add_up(*normal_equations(rng, 7)), *anchor
+    agree(kernel.separate(*kernel.with_pose(*of), 6), by_numpy.separate(*by_numpy.with_pose(*of), 6))
 
 
 def fractions(numbers: np.ndarray) -> np.ndarray:
@@ -303,6 +297,49 @@ def test_what_determines_nothing_is_an_error():
         kernel.separate(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 6, 6)), np.zeros((1, 0, 6)), 6)
 
 
+def around(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 4, 4) poses near by."""
+    return np.stack([perturb(AT_T, xi) for xi in shifts(rng, count)])
+
+
+@pytest.mark.parametrize("kinds", [0, 3])
+@pytest.mark.parametrize("displaced", [False, True])
+@pytest.mark.parametrize("unwatched", [0.0, 1e-3])
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatched: float, bare: bool):
+    rng = np.random.default_rng(kinds + 10 * displaced)
+    cam_T_grip, fit_T, from_T, origin_T = around(rng, 4)
+    alone, anchored, average, first, count = fits(rng), fits(rng), fits(rng, 5), fits(rng, 5), HYPOTHESES
+    floor, known, origin, usual = 0.1 * covariances(rng, 4)
+    prior, some = 10.0 ** rng.uniform(-5.0, -1.0, (3, count)), rng.uniform(size=(4, count)) < 0.7
+    prior[0, 0] = 1.0
+    wander, axis = rng.uniform(size=6) * SIZE[:6] ** 2, rng.normal(size=3)
+    frame = fit_T, tuple(alone), tuple(anchored), alone.covariance + floor, floor
+    besides = (tuple(fits(rng)), (prior[2], some[2], some[3])) if bare else NOTHING_BARE
+    before = shifts(rng, 1)[0], known, of_the_model(rng, 1)[0]
+    lasting = tuple(average), from_T, origin_T, origin, wander, rng.integers(-1, count, 5), prior[1, :5]
+    lasting = NOTHING_LASTS if displaced else lasting
+    of = frame, (prior[0], *some[:2]), prior[0] * some[3], besides, before, (axis, count - 1, 0.5, 1e-3, 0.1)
+    of = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-5, 1e-7, 1.44
+    cases, counts, spread, left = frame_kernel.gathered(*of)
+    expected, numbers, knock, out = by_numpy.gathered(*of)
+    probable = expected[3] > 1e-6
+    assert counts == numbers and probable.any() and len(cases[3]) == len(probable)
+    agree([each[probable] for each in cases], [each[probable] for each in expected])
+    agree((spread, left), (knock, out))
+    limits = 1e-5 - left, 1.2, 1.02, *QUANTILES
+    common, tilt = (of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])), 0.1 * rng.normal(size=(kinds, 6, 3))
+    since = tuple(first), np.eye(6), tilt, shifts(rng, 1)[0], *(0.1 * rng.normal(size=(2, 3))), shifts(rng, 1)[0]
+    for moves in (displaced, True):
+        of = cases, counts, spread, since, (usual, moves, unwatched, 1e-4), limits
+        one, other = frame_kernel.level_of_motion(*of), by_numpy.level_of_motion(*of)
+        assert one[2] == other[2] >= 0
+        np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+    one, other = (by.absolute_level(cases, counts[2], *common, limits) for by in (frame_kernel, by_numpy))
+    assert one[2] == other[2] >= 0
+    np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+
+
 KNOCKED_AT = 15  # frame
 
 
@@ -310,6 +347,8 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
     """Of the demo's camera over half a second, with a knock in the middle."""
     monkeypatch.setattr(separation, "kernel", by)
     monkeypatch.setattr(separation, "level_kernel", level_kernel if by is kernel else by)
+    for name in ("gathered", "absolute_level", "level_of_motion"):
+        monkeypatch.setattr(weigher, name, getattr(frame_kernel if by is kernel else by, name))
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))

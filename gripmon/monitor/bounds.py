@@ -19,6 +19,8 @@ SIGMA_INFLATION = 1.2
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
 """Published where there is no bound."""
 
+NOTHING_ALIKE = np.zeros((0, 6)), np.zeros(2)
+
 
 class ModelError(NamedTuple):
     """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
@@ -45,12 +47,14 @@ class ModelError(NamedTuple):
         first, reference_T = self.first
         return None if first is None else first.differences(cam_T_grip, reference_T, opened, self.common, swing)
 
+    def alike(self, cam_T_grip: Array) -> tuple[Array, Array]:
+        """What all fits near a pose (4, 4) are off by: by standard deviations (p, 6), and by these lengths (2,)."""
+        return NOTHING_ALIKE if self.common is None else (self.common.alike(cam_T_grip), self.common.farther)
+
     def absolute(self, sets: Iterable[Cases], cam_T_grip: Array) -> Doubts:
         """The doubts about a pose (4, 4), with what is common to all of them."""
-        if self.common is not None:
-            alike, farther = self.common.alike(cam_T_grip), self.common.farther
-            sets = (each._replace(alike=alike, farther=farther) for each in sets)
-        return Doubts(tuple(sets), SIGMA_INFLATION)
+        alike, farther = self.alike(cam_T_grip)
+        return Doubts(tuple(each._replace(alike=alike, farther=farther) for each in sets), SIGMA_INFLATION)
 
 
 def as_uncertain_again(cases: Cases) -> Cases:
@@ -65,14 +69,10 @@ def unbounded(risk: float, why: str) -> Bounds:
     return Bounds(none, none)
 
 
-def protection_of(doubts: Doubts, risk: float, left_out: float = 0.0) -> Protection:
-    """The protection levels at an integrity ``risk``, of which what isn't among the doubts takes the part ``left_out``;
-    where that is more than half of it, there is no bound.
-    """
-    if left_out > 0.5 * risk:
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "too much may be wrong at once")
-    position_m, rotation_rad, name = doubts.levels(risk - left_out)
-    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, name)
+def protection_of(levels: tuple[float, float, str], risk: float) -> Protection:
+    """The protection levels, m and rad, at an integrity ``risk``, with the name of what the position's owes most to."""
+    position_m, rotation_rad, hypothesis = levels
+    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, hypothesis)
 
 
 def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:

@@ -155,4 +155,4 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     cases = fits.cases(fits.away(cam_T_grip), hypotheses.prior, ~hypotheses.sudden)
     absolute, risk = possible.model.absolute([cases], cam_T_grip), settings.policy.integrity_risk
     since = Doubts((as_uncertain_again(cases),), SIGMA_INFLATION)
-    return Bounds(protection_of(absolute, risk), protection_of(since, risk))
+    return Bounds(protection_of(absolute.levels(risk), risk), protection_of(since.levels(risk), risk))

@@ -81,10 +81,12 @@ def square(covariance: Array, values: Array, root: Array, white: Array) -> float
     """
     total = 0.0
     if not _root(covariance, root):
-        solved = np.linalg.solve(covariance, values)
+        inverse = np.linalg.inv(covariance)
         for i in range(len(white)):
-            white[i] = solved[i]
-            total += values[i] * solved[i]
+            white[i] = 0.0
+            for k in range(len(white)):
+                white[i] += inverse[i, k] * values[k]
+            total += values[i] * white[i]
         return total
     for i in range(len(root)):
         rest = values[i]
@@ -240,39 +242,6 @@ def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float
 
 
 @compiled
-def with_and_without(
-    pull: Array,
-    information: Array,
-    middle: Array,
-    model: Array,
-    part: Ints,
-    parts: int,
-    keep: Array,
-    known: Array,
-    known_pull: Array,
-    at: Array,
-    covariance: Array,
-    off: Array,
-    times: float,
-    together: bool,
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
-    """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
-    besides, none of these if they aren't asked for ``together``, and the normalised squares (h,) of the former's
-    distance from that.
-    """
-    sums, normal, spread, of_model = add_up(
-        pull, information, middle, model, part, parts, keep, known, known_pull
-    )  # fmt: skip
-    alone = separate(sums, normal, spread, of_model, 6)
-    asked = len(sums) if together else 0
-    sums, normal, spread, of_model = with_pose(
-        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, covariance, off
-    )  # fmt: skip
-    with_it = separate(sums, normal, spread, of_model, 6)
-    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
-
-
-@compiled
 def refitted(
     predicted_T: Array,
     xi: Array,
@@ -295,8 +264,10 @@ def refitted(
     times: float,
     together: bool,
 ) -> tuple[Array, Array, tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
-    """A frame's fit under h hypotheses, by :func:`with_and_without`: its pose (4, 4), ``xi`` (m,) from the prediction,
-    where ``anchor_T`` (4, 4) is from there (6,), and what that function returns.
+    """A frame's fit under h hypotheses: its pose (4, 4), ``xi`` (m,) from the prediction, and where ``anchor_T`` (4, 4)
+    is from there (6,); then the fits' shifts, covariances and errors by the model by the kept edges alone, the same
+    with the anchor's pose, of a covariance ``known`` (6, 6) and errors by the model ``known_off`` (f or 1, 6), none of
+    these if they aren't asked for ``together``, and the normalised squares (h,) of the former's distances from it.
 
     ``pull`` to ``lasting``, of the edges ``edge`` (v,): as the fit has them; ``finger`` (e,) of each edge, of so many
     ``fingers``, and by how much one may be ``longer`` (3,), gripper frame, m: it pulls at a fit by all its edges
@@ -326,23 +297,27 @@ def refitted(
             for k in range(3):
                 model[0, v, i] += information[v, i, k] * tip[k]
     parts = fingers + len(finger)
-    of = with_and_without(
-        pull, information, middle, model, part, parts, keep, held, held_pull, at, known, known_off, times, together
-    )
-    return fit_T, at, of[0], of[1], of[2]
+    sums, normal, spread, of_model = add_up(
+        pull, information, middle, model, part, parts, keep, held, held_pull
+    )  # fmt: skip
+    alone = separate(sums, normal, spread, of_model, 6)
+    asked = len(sums) if together else 0
+    sums, normal, spread, of_model = with_pose(
+        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, known, known_off
+    )  # fmt: skip
+    with_it = separate(sums, normal, spread, of_model, 6)
+    return fit_T, at, alone, with_it, squares(alone[0], at, alone[1], alone[2], times, known, known_off)
 
 
 @compiled
-def _blend(mean: Array, other: Array, share: Array, upper: Array, backward: bool, out: Array) -> None:
-    """``out`` (6,): mean + S U' (other - mean), S = ``share`` and U = ``upper``; the roles swapped if ``backward``."""
+def _blend(mean: Array, other: Array, gain: Array, backward: bool, out: Array) -> None:
+    """``out`` (6,): mean + K (other - mean), K = ``gain``; the roles swapped if ``backward``."""
     for i in range(6):
         out[i] = other[i] if backward else mean[i]
     for k in range(6):
-        white = 0.0
-        for j in range(6):
-            white += upper[j, k] * (mean[j] - other[j] if backward else other[j] - mean[j])
+        way = mean[k] - other[k] if backward else other[k] - mean[k]
         for i in range(6):
-            out[i] += share[i, k] * white
+            out[i] += gain[i, k] * way
 
 
 @compiled
@@ -382,20 +357,23 @@ def join(
             white[i, j] = 0.0
             for k in range(6):
                 white[i, j] += smaller[i, k] * upper[k, j]
-    share, taken = white if rooted else smaller, 0.0
+    share, gain, taken = white if rooted else smaller, both, 0.0
     for i in range(6):
         for j in range(6):
-            taken += share[i, j] * upper[i, j]
+            gain[i, j] = 0.0
+            for k in range(6):
+                gain[i, j] += share[i, k] * upper[j, k]
+        taken += gain[i, i]
         for j in range(i + 1):
             total = 0.0
             for k in range(6):
                 total += share[i, k] * white[j, k]
             new_covariance[i, j] = new_covariance[j, i] = smaller[i, j] - total
-    _blend(mean, shift, share, upper, backward, new_mean)
+    _blend(mean, shift, gain, backward, new_mean)
     for f in range(len(new_off)):
         before_off = off[min(f, len(off) - 1)]
         if before_off.any() or of_model[f].any():
-            _blend(before_off, of_model[f], share, upper, backward, new_off[f])
+            _blend(before_off, of_model[f], gain, backward, new_off[f])
         else:
             for i in range(6):
                 new_off[f, i] = 0.0
@@ -447,8 +425,9 @@ def jumped(
                 total += out[h, c]
         if stays[h]:
             total += max(stay, 0.0) * math.exp(log_density[kinds] - highest)
-        if total > 0.0:
-            out[h] /= total
+        for c in range(kinds):
+            if total > 0.0:
+                out[h, c] /= total
     return out
 
 
@@ -498,7 +477,8 @@ def knocked(
     share: Array,
     along: Bools,
     prior: Array,
-    probable: Array,
+    seen: float,
+    unseen: float,
     stays: Bools,
     endless: Bools,
     least: float,
@@ -508,14 +488,14 @@ def knocked(
     (r,), their probabilities (r,), and that of all others.
 
     ``share`` (c,): how probable each of the ``jumps`` (c, 6, 6) is once there is one, ``along`` (c,): those that an
-    ``endless`` (h,) fit doesn't show, so that nothing is held against them; ``prior`` (h,): of the fits; ``probable``
-    (h,): of a jump under each.  The others as for :func:`jumped`.
+    ``endless`` (h,) fit doesn't show, so that nothing is held against them: that no end of a finger is left; ``prior``
+    (h,): of the fits; ``unseen``: of a jump under these, ``seen``: under the others.  The rest as for :func:`jumped`.
     """
     count, kinds = len(prior), len(share)
     weight, total, before = np.zeros((count, kinds)), 0, np.zeros((count, kinds))
     for h in range(count):
         for c in range(kinds):
-            before[h, c] = probable[h] * share[c] if prior[h] > 0.0 else 0.0
+            before[h, c] = (unseen if endless[h] else seen) * share[c] if prior[h] > 0.0 else 0.0
     given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
     left_out = 0.0
     for h in range(count):
@@ -596,5 +576,10 @@ def telling(
         own = of_frame[h, 0, 0] + of_frame[h, 1, 1] + of_frame[h, 2, 2]
         surer = own < spread[g, 0, 0] + spread[g, 1, 1] + spread[g, 2, 2]
         if surer or square(of_frame[h] + spread[g], shift[h] - away[g], root, white) > limit:
-            away[g], spread[g], error[g] = shift[h], of_frame[h], of_model[h]
+            for i in range(6):
+                away[g, i] = shift[h, i]
+                for k in range(6):
+                    spread[g, i, k] = of_frame[h, i, k]
+                for f in range(off.shape[1]):
+                    error[g, f, i] = of_model[h, f, i]
     return away, spread, error

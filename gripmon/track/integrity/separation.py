@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from gripmon.model.records import Array
-from gripmon.track.integrity import kernel, level_kernel
-from gripmon.track.integrity.knocks import Knocks, least_known
+from gripmon.track.integrity import frame_kernel, kernel, level_kernel
 
 LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
@@ -122,62 +121,6 @@ def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple
 def begun(first: Separation, lever: Array, turn: Array, more: Array) -> Separation:
     """What the fits ``first`` at the reference take from a motion since, see :func:`level_kernel.begun`."""
     return Separation(*level_kernel.begun(*first, lever, turn, more))
-
-
-def telling(
-    averages: Separation, at: Array, wander: Array, frame: Separation, rows: NDArray[np.intp], limit: float
-) -> Separation:
-    """Under each hypothesis what knows more by the position's variances, the average, from ``at`` (6,) and after a way
-    with the variances ``wander`` (6,), or the frame's fit ``rows`` (g,); but the frame's where they differ by more than
-    a normalised square of ``limit``.  A negative row is no fit.
-    """
-    return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
-
-
-class Knocked(NamedTuple):
-    """That a pose was knocked, under r of h hypotheses: which ``fit`` (r,) and which ``jump`` (r,), the ``prior`` (r,)
-    of both together, and ``left_out``, that of all others.
-    """
-
-    fit: NDArray[np.intp]
-    jump: NDArray[np.intp]
-    prior: Array
-    left_out: float
-
-
-def knocked(
-    frame: Separation,
-    known: tuple[Array, Array, Array],
-    knocks: Knocks,
-    prior: Array,
-    probable: Array,
-    stays: NDArray[np.bool_],
-    endless: NDArray[np.bool_],
-    least: float,
-    times: float,
-) -> Knocked:
-    """Under which hypotheses the pose, ``known`` to have been somewhere (6,) but for a covariance (6, 6) and errors by
-    the model (f or 1, 6), was knocked, given the frame's fits.  What is less probable than ``least`` is left out.
-
-    ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether it may as well
-    have stayed; ``endless`` (h,): whether no end of a finger is left, which alone show a knock along the fingers: that
-    it is exactly along them isn't held against it then.  ``times``: factor on the fits' covariances for their tails.
-    """
-    of = knocks.covariance, knocks.share, knocks.along
-    return Knocked(*kernel.knocked(*frame, *known, *of, prior, probable, stays, endless, least, times))
-
-
-def after_knocks(
-    frame: Separation, known: tuple[Array, Array, Array], knocks: Knocks, of: Knocked, share: float
-) -> Separation:
-    """Where the pose is after the knocks ``of`` :func:`knocked` that are more probable than a ``share``; zeros for the
-    others.
-    """
-    shift, covariance, of_model = frame
-    jumps = knocks.covariance
-    return Separation(
-        *kernel.after_jumps(shift, covariance, of_model, *known, jumps, of.fit, of.jump, of.prior, share)
-    )
 
 
 class Tails(NamedTuple):
@@ -324,14 +267,19 @@ def warm_up() -> None:
         normal, known = (row, each, each, row, edge), (here, np.eye(6), np.zeros((1, 6)))
         made = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
         _, at, fits, _, _ = refitted(*made, 1.0)
-    averages, _ = follow(fits, fits, none)
-    before = at, np.eye(6), fits.of_model[0]
-    knocks = Knocks.of(least_known(np.eye(6), np.ones(3), 0.0))
-    found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
-    after_knocks(fits, before, knocks, found, 0.0)
-    told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))
+    follow(fits, fits, none)
+    told = with_known(fits, none, np.eye(6))
     motion = begun(fits, *motion_since(here, here, here)[:2], np.eye(6))
     cases = Cases.of(("", ""), np.ones(2), told)
     of = np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6)
     since = Moved(cases.prior, cases, edge, motion, *of)
     Doubts((cases, since), 1.0).levels(1e-5)
+    doubts, alike, limits = (some, yes, yes), np.zeros((0, 6)), (1e-5, 1.0, LEVEL_TOLERANCE_RATIO, *QUANTILES)
+    frame = here, tuple(fits), tuple(fits), fits.covariance, np.eye(6)
+    bare, knocks, before = (tuple(fits), doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), alike)
+    lasting, since_first = (tuple(fits), here, here, np.eye(6), none, edge, some), (tuple(motion), *of[:-1])
+    every = frame_kernel.gathered(
+        here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
+    )  # fmt: skip
+    frame_kernel.absolute_level(every[0], 2, alike, np.zeros(2), limits)
+    frame_kernel.level_of_motion(*every[:3], since_first, (np.eye(6), False, 0.0, 0.1), limits)
