@@ -19,8 +19,6 @@ SIGMA_INFLATION = 1.2
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
 """Published where there is no bound."""
 
-NOTHING_ALIKE = np.zeros((0, 6)), np.zeros(2)
-
 
 class ModelError(NamedTuple):
     """The gripper file's error: each finger longer or shorter by a standard deviation ``sigma_m``, along ``axis_grip``
@@ -49,7 +47,8 @@ class ModelError(NamedTuple):
 
     def alike(self, cam_T_grip: Array) -> tuple[Array, Array]:
         """What all fits near a pose (4, 4) are off by: by standard deviations (p, 6), and by these lengths (2,)."""
-        return NOTHING_ALIKE if self.common is None else (self.common.alike(cam_T_grip), self.common.farther)
+        common = self.common
+        return (np.zeros((0, 6)), np.zeros(2)) if common is None else (common.alike(cam_T_grip), common.farther)
 
     def absolute(self, sets: Iterable[Cases], cam_T_grip: Array) -> Doubts:
         """The doubts about a pose (4, 4), with what is common to all of them."""

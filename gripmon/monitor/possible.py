@@ -37,12 +37,13 @@ MOST_KEPT = 64
 
 
 class About(NamedTuple):
-    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, and
-    ``rows`` (g,), which hypothesis each lasting one is.
+    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, ``pairs``
+    of these that doubt more than the ends, and ``rows`` (g,), which hypothesis each lasting one is.
     """
 
     hypotheses: Hypotheses
     without_ends: Hypotheses
+    pairs: Hypotheses
     rows: NDArray[np.intp]
 
 
@@ -77,7 +78,9 @@ class Possible:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
             hypotheses = self.hypotheses(edges)
-            self._kept[key] = About(hypotheses, hypotheses.without_ends(), self.lasting.rows(hypotheses, edges))
+            without = hypotheses.without_ends()
+            rows = self.lasting.rows(hypotheses, edges)
+            self._kept[key] = About(hypotheses, without, without.pairs(), rows)
         return self._kept[key]
 
 

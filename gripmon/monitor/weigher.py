@@ -38,8 +38,6 @@ from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Cases, Doubts, Knocks, Mount, Separation, bounds
 from gripmon.track.integrity.frame_kernel import (
-    NOTHING_BARE,
-    NOTHING_LASTS,
     Bound,
     absolute_level,
     gathered,
@@ -195,7 +193,7 @@ class Weigher:
         both = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
-        made_of = fits if proven or without is None else without
+        made_of = without if without is not None and not proven and (displaced or not self.proved) else fits
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
         # What was taken for the ends when the strips were learnt looks right ever after.
@@ -278,19 +276,21 @@ class Weigher:
         hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
         """
         anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
-        ends, solved, bare, names = fits.hypotheses.ends, prior, NOTHING_BARE, fits.hypotheses.name
+        doubts, ends, risk = fits.doubted(prior), fits.hypotheses.ends, self._policy.integrity_risk
+        none, names, solved = tuple(each[:0] for each in fits.alone), fits.hypotheses.name, prior
+        bare = none, (prior[:0], *(each[:0] for each in doubts[1:]))
         if without is fits:  # then that of the ends is the same as that nothing is wrong
             solved = prior * (np.arange(len(prior)) != ends)
         elif without is not None:
             of, names = without.hypotheses, names + without.hypotheses.name
             bare = without.alone, without.doubted(prior[ends] * of.prior * of.more_than_ends)
         names += lasting.name + in_the_references_frames(lasting.name)
-        always, at_first = NOTHING_LASTS, np.zeros(0) if first is None else lasting.priors(first.misread)
+        rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
+        at_first = prior[:0] if first is None else lasting.priors(first.misread)
+        always = (none, cam_T_grip, *self.expected, wander, rows[:0], prior[:0])
         if anchor is not None and not displaced:
-            rows, misread = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
-            always = *anchor.known, self._wander(now_s), rows, misread
+            always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
         knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
-        doubts, risk = fits.doubted(prior), self._policy.integrity_risk
         cases, counts, spread, left_out = gathered(
             cam_T_grip, displaced, fits.frame, doubts, solved, bare, fits.before, knocks, always, at_first, risk,
             self._least, SIGMA_INFLATION**2,
@@ -341,9 +341,10 @@ class Weigher:
         """
         if not fits.hypotheses.across.any():
             return fits
-        if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
-            return None
-        return fits.under(self._possible.about(fits.edges).without_ends)
+        about = self._possible.about(fits.edges)
+        if displaced or not self.proved:
+            return fits.under(about.without_ends)
+        return None if besides * WRONG_EDGE <= self._least else fits.under(about.pairs)
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float

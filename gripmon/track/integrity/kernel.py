@@ -392,6 +392,7 @@ def jumped(
     prior: Array,
     stays: Bools,
     times: float,
+    enough: Array,
 ) -> Array:
     """Probabilities (h, c) of the jumps that may have carried a pose away from where it is known to have been, given
     a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6) and errors by the model, ``off`` (h, f, 6).
@@ -399,34 +400,42 @@ def jumped(
     ``at`` (6,) with its covariance ``known`` C (6, 6) and ``known_off`` (f or 1, 6): the pose before; ``jumps`` J
     (c, 6, 6), of the probability ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a
     jump's probability is its prior times the normal density of the fit with ``times`` R + C + J (and :func:`between`),
-    over the sum of these and of having stayed.
+    over the sum of these and of having stayed.  Where they are together no more than ``enough`` (h,) though the fit
+    were in the middle of the wider densities, which are nowhere higher than the middle of the narrowest: that.
     """
     count, kinds = prior.shape
-    root, white, apart, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    log_density, out = np.empty(kinds + 1), np.zeros((count, kinds))
+    root, white, way, log_density = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(kinds + 1)
+    apart, both, out = np.empty((6, 6)), np.empty((6, 6)), np.zeros((count, kinds))
     for h in range(count):
-        highest, stay = -math.inf, 1.0
+        ever = prior[h].sum()
+        if ever == 0.0:
+            continue
         between(covariance[h], off[h], known, known_off, times, apart)
-        for c in range(kinds + 1):
+        for i in range(6):
+            way[i] = shift[h, i] - at[i]
+        highest, stay, likelier, solved = -math.inf, max(1.0 - ever, 0.0), 0.0, True
+        for c in range(kinds, -1, -1):
             log_density[c] = -math.inf
-            if stays[h] if c == kinds else prior[h, c] > 0.0:
+            if solved and (stays[h] if c == kinds else prior[h, c] > 0.0):
                 for i in range(6):
                     for j in range(6):
                         both[i, j] = apart[i, j] + (jumps[c, i, j] if c < kinds else 0.0)
-                log_density[c] = -0.5 * square(both, shift[h] - at, root, white)
+                normalised, scale = square(both, way, root, white), 1.0
                 for i in range(6):
-                    log_density[c] += math.log(root[i, i])
+                    scale *= root[i, i]
+                log_density[c] = math.log(scale) - 0.5 * normalised
+                if c == kinds:
+                    likelier = math.exp(0.5 * normalised) / stay
+                    solved = ever * likelier > enough[h]
             highest = max(highest, log_density[c])
         total = 0.0
         for c in range(kinds):
-            stay -= prior[h, c]
-            if prior[h, c] > 0.0:
-                out[h, c] = prior[h, c] * math.exp(log_density[c] - highest)
-                total += out[h, c]
+            out[h, c] = prior[h, c] * (math.exp(log_density[c] - highest) if solved else likelier)
+            total += out[h, c]
         if stays[h]:
-            total += max(stay, 0.0) * math.exp(log_density[kinds] - highest)
+            total += stay * math.exp(log_density[kinds] - highest)
         for c in range(kinds):
-            if total > 0.0:
+            if solved and total > 0.0:
                 out[h, c] /= total
     return out
 
@@ -492,11 +501,12 @@ def knocked(
     (h,): of the fits; ``unseen``: of a jump under these, ``seen``: under the others.  The rest as for :func:`jumped`.
     """
     count, kinds = len(prior), len(share)
-    weight, total, before = np.zeros((count, kinds)), 0, np.zeros((count, kinds))
+    weight, total, before, enough = np.zeros((count, kinds)), 0, np.zeros((count, kinds)), np.zeros(count)
     for h in range(count):
+        enough[h] = least / prior[h]
         for c in range(kinds):
             before[h, c] = (unseen if endless[h] else seen) * share[c] if prior[h] > 0.0 else 0.0
-    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times, enough)
     left_out = 0.0
     for h in range(count):
         for c in range(kinds):

@@ -13,7 +13,6 @@ import math
 import numpy as np
 
 from gripmon.model.compiled import compiled
-from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints, join, square
 
@@ -216,78 +215,6 @@ def levels(
             if part_of_it > largest:
                 largest, owed = part_of_it, h
     return most[0], most[1], owed
-
-
-@compiled
-def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> None:
-    """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
-    for i in range(6):
-        for j in range(6):
-            half[i, j] = 0.0
-            for k in range(6):
-                half[i, j] += jacobian[i, k] * covariance[k, j]
-    for i in range(6):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(6):
-                total += half[i, k] * jacobian[j, k]
-            out[i, j] += total
-            if j < i:
-                out[j, i] += total
-
-
-@compiled
-def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Of a pose x, ``cam_T_grip``, and the one ``first_T`` that it had at the reference, x_b: the Jacobians (6, 6)
-    ``lever`` from the difference of their errors to that of exp(d) reference, which is as far from x_b as the reference
-    is wrong, and ``turn`` of an error of x_b to camera axes as they are after d; the motion exp(d), exp(d) reference,
-    (4, 4) each, and the perturbation (6,) from there back to the reference.
-    """
-    lever, turn, motion, at_T = np.eye(6), np.zeros((6, 6)), np.zeros((4, 4)), np.zeros((4, 4))
-    arm = np.zeros(3)
-    motion[3, 3] = at_T[3, 3] = 1.0
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                motion[i, j] += cam_T_grip[i, k] * first_T[j, k]
-            turn[i, j] = turn[3 + i, 3 + j] = motion[i, j]
-        motion[i, 3] = at_T[i, 3] = cam_T_grip[i, 3]
-        for k in range(3):
-            motion[i, 3] -= motion[i, k] * first_T[k, 3]
-            arm[i] += motion[i, k] * (reference_T[k, 3] - first_T[k, 3])
-            for j in range(3):
-                at_T[i, j] += motion[i, k] * reference_T[k, j]
-        at_T[i, 3] += arm[i]
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        lever[a, 3 + b], lever[b, 3 + a] = arm[i], -arm[i]
-    return lever, turn, motion, at_T, perturbation_between(at_T, reference_T)
-
-
-@compiled
-def begun(
-    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
-) -> tuple[Array, Array, Array]:
-    """What g fits b at the reference, ``shift`` (g, 6), ``covariance`` C (g, 6, 6) and errors by the model ``off``
-    (g, f, 6), take from a motion since: L T of the shifts and of the errors, and the covariances L (T C T' + M) L',
-    with the Jacobians ``lever`` L and ``turn`` T and M = ``more`` (6, 6).
-    """
-    count, turned = len(shift), lever @ turn
-    half, besides = np.empty((6, 6)), np.zeros((6, 6))
-    shifts, covariances, offs = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros(off.shape)
-    _seen_from(more, lever, half, besides)
-    for g in range(count):
-        _seen_from(covariance[g], turned, half, covariances[g])
-        for i in range(6):
-            for k in range(6):
-                covariances[g, i, k] += besides[i, k]
-                shifts[g, i] += turned[i, k] * shift[g, k]
-        for f in range(off.shape[1]):
-            if off[g, f].any():  # most edges of a gripper are seen in no frame
-                for i in range(6):
-                    for k in range(6):
-                        offs[g, f, i] += turned[i, k] * off[g, f, k]
-    return shifts, covariances, offs
 
 
 @compiled

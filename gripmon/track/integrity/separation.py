@@ -113,16 +113,6 @@ def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
     return Separation(*kernel.with_known(*fits, at, covariance))
 
 
-def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """See :func:`level_kernel.motion_since`."""
-    return level_kernel.motion_since(cam_T_grip, first_T, reference_T)
-
-
-def begun(first: Separation, lever: Array, turn: Array, more: Array) -> Separation:
-    """What the fits ``first`` at the reference take from a motion since, see :func:`level_kernel.begun`."""
-    return Separation(*level_kernel.begun(*first, lever, turn, more))
-
-
 class Tails(NamedTuple):
     """How probably normal vectors are longer than something: ``sigma`` (...,) along the longest axis of each, and the
     power of ten ``factor`` (...,) by which the two others raise the tail of that one.
@@ -269,15 +259,16 @@ def warm_up() -> None:
         _, at, fits, _, _ = refitted(*made, 1.0)
     follow(fits, fits, none)
     told = with_known(fits, none, np.eye(6))
-    motion = begun(fits, *motion_since(here, here, here)[:2], np.eye(6))
+    motion = frame_kernel.begun(here, here, here, *fits, np.eye(6))[0]
+    frame_kernel.motion_since(here, here, here)
     cases = Cases.of(("", ""), np.ones(2), told)
     of = np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6)
-    since = Moved(cases.prior, cases, edge, motion, *of)
+    since = Moved(cases.prior, cases, edge, Separation(*motion), *of)
     Doubts((cases, since), 1.0).levels(1e-5)
     doubts, alike, limits = (some, yes, yes), np.zeros((0, 6)), (1e-5, 1.0, LEVEL_TOLERANCE_RATIO, *QUANTILES)
     frame = here, tuple(fits), tuple(fits), fits.covariance, np.eye(6)
     bare, knocks, before = (tuple(fits), doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), alike)
-    lasting, since_first = (tuple(fits), here, here, np.eye(6), none, edge, some), (tuple(motion), *of[:-1])
+    lasting, since_first = (tuple(fits), here, here, np.eye(6), none, edge, some), (motion, *of[:-1])
     every = frame_kernel.gathered(
         here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
     )  # fmt: skip

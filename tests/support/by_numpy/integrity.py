@@ -69,6 +69,7 @@ def jumped(
     prior: Array,
     stays: Array,
     times: float,
+    enough: Array,
 ) -> Array:
     every = np.concatenate([jumps, np.zeros((1, 6, 6))])
     share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
@@ -79,7 +80,10 @@ def jumped(
     square = (away * np.linalg.solve(both, np.broadcast_to(away, (*both.shape[:3], 1)))).sum(axis=(2, 3))
     log_density = -0.5 * (square + np.linalg.slogdet(both)[1])
     weight = share * np.exp(log_density - np.max(log_density, axis=1, keepdims=True))
-    return np.asarray((weight / weight.sum(axis=1, keepdims=True))[:, :-1])
+    with np.errstate(divide="ignore", over="ignore"):
+        most = prior * (np.exp(0.5 * square[:, -1]) / (1.0 - prior.sum(axis=1)))[:, None]
+    bounded = stays & (most.sum(axis=1) <= enough)
+    return np.where(bounded[:, None], most, (weight / weight.sum(axis=1, keepdims=True))[:, :-1])
 
 
 def joined(
@@ -134,7 +138,8 @@ def knocked(
     times: float,
 ) -> tuple[Ints, Ints, Array, float]:
     before = np.outer(np.where(endless, unseen, seen), share)
-    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    enough = least / np.maximum(prior, 1e-300)
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times, enough)
     weight = prior[:, None] * np.where(np.outer(endless, along), np.maximum(given, before), given)
     counts = weight > least
     fit, jump = np.nonzero(counts)
@@ -229,10 +234,12 @@ def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple
 
 
 def begun(
-    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
-) -> tuple[Array, Array, Array]:
+    cam_T_grip: Array, first_T: Array, reference_T: Array, shift: Array, covariance: Array, off: Array, more: Array
+) -> tuple[tuple[Array, Array, Array], Array, Array, Array, Array]:
+    lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, first_T, reference_T)
     turned = lever @ turn
-    return shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
+    fits = shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
+    return fits, lever, motion[:3, 3], at_T[:3, 3], unmoved
 
 
 def multivariate_density(way: Array, covariance: Array) -> Array:
