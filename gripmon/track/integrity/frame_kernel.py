@@ -67,9 +67,10 @@ def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> N
     """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
     for i in range(6):
         for j in range(6):
-            half[i, j] = 0.0
+            total = 0.0
             for k in range(6):
-                half[i, j] += jacobian[i, k] * covariance[k, j]
+                total += jacobian[i, k] * covariance[k, j]
+            half[i, j] = total
     for i in range(6):
         for j in range(i + 1):
             total = 0.0
@@ -202,7 +203,8 @@ def gathered(
     here, g, h, b, many = np.flatnonzero(stays), len(rows), len(prior), len(bare_shift), len(first_prior)
     count = len(here) + len(fit) + len(bare_fit) + 2 * g + max(many - 1, 0)
     every, nowhere, nothing = np.arange(count), np.zeros(6), np.zeros((6, 6))
-    rare = 0.5 * (risk - left_out) / (count + many + 1)  # less than an equal share of the risk, of whichever cases
+    # No more than an equal share of the risk: what is as improbable isn't bounded, whichever cases count how often.
+    rare = (risk - left_out) / (count + len(here) + many + 1)
     after = after_jumps(shift, own, off, place, before, known_off, jumps, fit, jump, weight, rare)
     bare_after = after_jumps(
         bare_shift, bare_own, bare_off, place, before, known_off, jumps, bare_fit, bare_jump, bare_weight, rare

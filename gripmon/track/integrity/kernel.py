@@ -114,21 +114,24 @@ def add_up(
     """
     count, (edges, m) = len(keep), pull.shape
     sums, normal, spread = known_pull.copy(), known.copy(), known.copy()
-    of_model = np.zeros((count, parts, m))
+    of_model, kept = np.zeros((count, parts, m)), np.empty(edges, np.intp)
     for h in range(count):
+        number = 0
         for v in range(edges):
             if keep[h, v] == 0.0:
                 continue
+            kept[number], number = v, number + 1
             for i in range(m):
                 sums[h, i] += pull[v, i]
                 for p in range(len(part)):
                     of_model[h, part[p, v], i] += model[p, v, i]
-                for j in range(i + 1):
-                    normal[h, i, j] += information[v, i, j]
-                    spread[h, i, j] += middle[v, i, j]
         for i in range(m):
-            for j in range(i):
-                normal[h, j, i], spread[h, j, i] = normal[h, i, j], spread[h, i, j]
+            for j in range(i + 1):
+                one, other = normal[h, i, j], spread[h, i, j]
+                for k in range(number):
+                    one, other = one + information[kept[k], i, j], other + middle[kept[k], i, j]
+                normal[h, i, j] = normal[h, j, i] = one
+                spread[h, i, j] = spread[h, j, i] = other
     return sums, normal, spread, of_model
 
 
@@ -138,9 +141,10 @@ def _around(matrix: Array, middle: Array, half: Array, out: Array) -> None:
     m = len(matrix)
     for i in range(m):
         for j in range(m):
-            half[i, j] = 0.0
+            total = 0.0
             for k in range(m):
-                half[i, j] += matrix[k, i] * middle[k, j]
+                total += matrix[k, i] * middle[k, j]
+            half[i, j] = total
         for j in range(i + 1):
             total = 0.0
             for k in range(m):
@@ -159,13 +163,17 @@ def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknown
     for h in range(count):
         rooted = _inverse(normal[h], inverse, root, upper)
         for i in range(n):
+            total = 0.0
             for j in range(m):
-                shift[h, i] += inverse[i, j] * sums[h, j]
+                total += inverse[i, j] * sums[h, j]
+            shift[h, i] = total
         for f in range(fingers):
             if of_model[h, f].any():  # most edges of a gripper are seen in no frame
                 for i in range(n):
+                    total = 0.0
                     for j in range(m):
-                        off[h, f, i] += inverse[i, j] * of_model[h, f, j]
+                        total += inverse[i, j] * of_model[h, f, j]
+                    off[h, f, i] = total
         # U (U' spread U) U': multiplied by N^-1 itself, an open direction takes the digits of all others.
         middle, half = spread[h], root
         if rooted:
@@ -173,9 +181,10 @@ def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknown
             middle = inverse
         for i in range(n):
             for j in range(m):
-                half[i, j] = 0.0
+                total = 0.0
                 for k in range(m):
-                    half[i, j] += upper[i, k] * middle[k, j]
+                    total += upper[i, k] * middle[k, j]
+                half[i, j] = total
             for j in range(i + 1):
                 total = 0.0
                 for k in range(m):
@@ -312,12 +321,12 @@ def refitted(
 @compiled
 def _blend(mean: Array, other: Array, gain: Array, backward: bool, out: Array) -> None:
     """``out`` (6,): mean + K (other - mean), K = ``gain``; the roles swapped if ``backward``."""
+    first, last = (other, mean) if backward else (mean, other)
     for i in range(6):
-        out[i] = other[i] if backward else mean[i]
-    for k in range(6):
-        way = mean[k] - other[k] if backward else other[k] - mean[k]
-        for i in range(6):
-            out[i] += gain[i, k] * way
+        total = first[i]
+        for k in range(6):
+            total += gain[i, k] * (last[k] - first[k])
+        out[i] = total
 
 
 @compiled
@@ -354,15 +363,17 @@ def join(
     rooted = _inverse(both, white, work[4], upper)
     for i in range(6):
         for j in range(6):
-            white[i, j] = 0.0
+            total = 0.0
             for k in range(6):
-                white[i, j] += smaller[i, k] * upper[k, j]
+                total += smaller[i, k] * upper[k, j]
+            white[i, j] = total
     share, gain, taken = white if rooted else smaller, both, 0.0
     for i in range(6):
         for j in range(6):
-            gain[i, j] = 0.0
+            total = 0.0
             for k in range(6):
-                gain[i, j] += share[i, k] * upper[j, k]
+                total += share[i, k] * upper[j, k]
+            gain[i, j] = total
         taken += gain[i, i]
         for j in range(i + 1):
             total = 0.0

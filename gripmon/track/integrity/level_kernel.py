@@ -55,26 +55,18 @@ def _enter(
     position and in rotation, and the tails of its error, sigma twice and factor twice, with its ``covariance`` (6, 6)
     and the errors by the model, ``off`` (f, 6) and ``alike`` (p, 6).
     """
-    block = np.empty((3, 3))
-    for part in range(2):
-        first, total = 3 * part, 0.0
-        for i in range(3):
-            total += shift[first + i] ** 2
-            for j in range(i + 1):
-                block[i, j] = inflation**2 * covariance[first + i, first + j]
+    more = inflation**2
+    for x in range(0, 6, 3):
+        y, z, part = x + 1, x + 2, x // 3
+        xx, yy, zz = more * covariance[x, x], more * covariance[y, y], more * covariance[z, z]
+        xy, xz, yz = more * covariance[y, x], more * covariance[z, x], more * covariance[z, y]
         for error in (off, alike):
             for f in range(len(error)):
-                a, b, c = error[f, first], error[f, first + 1], error[f, first + 2]
-                block[0, 0] += a * a
-                block[1, 0] += b * a
-                block[1, 1] += b * b
-                block[2, 0] += c * a
-                block[2, 1] += c * b
-                block[2, 2] += c * c
-        table[1 + part, number] = math.sqrt(total)
-        table[3 + part, number], table[5 + part, number] = _tail(
-            block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
-        )
+                a, b, c = error[f, x], error[f, y], error[f, z]
+                xx, yy, zz = xx + a * a, yy + b * b, zz + c * c
+                xy, xz, yz = xy + b * a, xz + c * a, yz + c * b
+        table[1 + part, number] = math.sqrt(shift[x] ** 2 + shift[y] ** 2 + shift[z] ** 2)
+        table[3 + part, number], table[5 + part, number] = _tail(xx, yy, zz, xy, xz, yz)
 
 
 @compiled
@@ -250,10 +242,11 @@ def _levered(covariance: Array, lever: Array, out: Array) -> None:
     half = np.empty((6, 6))
     for i in range(6):
         for j in range(6):
-            half[i, j] = covariance[i, j]
+            total = covariance[i, j]
             if i < 3:
                 for k in range(3, 6):
-                    half[i, j] += lever[i, k] * covariance[k, j]
+                    total += lever[i, k] * covariance[k, j]
+            half[i, j] = total
     for i in range(6):
         for j in range(i + 1):
             total = half[i, j]

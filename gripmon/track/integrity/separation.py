@@ -267,7 +267,7 @@ def warm_up() -> None:
     Doubts((cases, since), 1.0).levels(1e-5)
     doubts, alike, limits = (some, yes, yes), np.zeros((0, 6)), (1e-5, 1.0, LEVEL_TOLERANCE_RATIO, *QUANTILES)
     frame = here, tuple(fits), tuple(fits), fits.covariance, np.eye(6)
-    bare, knocks, before = (tuple(fits), doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), alike)
+    bare, knocks, before = (tuple(fits), doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), fits.of_model[0])
     lasting, since_first = (tuple(fits), here, here, np.eye(6), none, edge, some), (motion, *of[:-1])
     every = frame_kernel.gathered(
         here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
