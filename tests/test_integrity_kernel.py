@@ -116,8 +116,7 @@ def test_a_frames_refits_are_those_of_numpy(m: int):
 
 def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | None) -> tuple[np.ndarray, np.ndarray]:
     """(7, n) each, compiled and NumPy's, of some fits of a pose and some of the motion since."""
-    frame, first, away = fits(rng), fits(rng), shifts(rng, 1)[0]
-    rows, prior = rng.integers(0, HYPOTHESES, 9), 10.0 ** rng.uniform(-4.0, 0.0, 9)
+    frame, first, prior = fits(rng, 9), fits(rng), 10.0 ** rng.uniform(-4.0, 0.0, 9)
     poses = [perturb(AT_T, 10.0 * xi) for xi in shifts(rng, 3)]
     for one, other in zip(frame_kernel.motion_since(*poses), by_numpy.motion_since(*poses), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-14)
@@ -126,7 +125,7 @@ def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | No
     agree(made, begun)
     for one, other in zip((lever, *places), others, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-14)
-    of = *frame, rows, prior, away, 0.1 * covariances(rng, 1)[0]
+    of = *frame, prior
     by_motion, places = 0.1 * rng.normal(size=(kinds, 6, 3)), 0.1 * rng.normal(size=(2, 3))
     motion = by_motion, shifts(rng, 1)[0], places[0], places[1], shifts(rng, 1)[0]
     known = 5.0 * covariances(rng, 1)[0] if staying else np.zeros((0, 6))

@@ -58,8 +58,8 @@ class ModelError(NamedTuple):
 
 def as_uncertain_again(cases: Cases) -> Cases:
     """Of the motion since the reference, while this frame is the first one."""
-    fits = Separation(cases.fits.shift, 2.0 * cases.fits.covariance, np.zeros((len(cases.fits.shift), 0, 6)))
-    return cases._replace(fits=fits, more=2.0 * cases.more)
+    shift, covariance, _ = cases.fits
+    return cases._replace(fits=Separation(shift, 2.0 * covariance, np.zeros((len(shift), 0, 6))))
 
 
 def unbounded(risk: float, why: str) -> Bounds:

@@ -120,8 +120,9 @@ class Refits:
         """What may be wrong with a published pose, :meth:`away`, under the ``chosen`` hypotheses (h,) of probability
         ``prior`` (h,), by the frame alone.
         """
-        rows = chosen.nonzero()[0]
-        return Cases(prior[rows], self.hypotheses.name, rows, rows, self._free, away, self._floor)
+        rows, shift = chosen.nonzero()[0], self._free.shift - away
+        fits = Separation(shift[rows], self.covariance[rows], self.of_model[rows])
+        return Cases(prior[rows], self.hypotheses.name, rows, fits)
 
     @property
     def alone(self) -> Fits:

@@ -302,7 +302,8 @@ class Weigher:
         differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if first is None or differences is None:  # this frame is the first one
             rows = np.append(np.arange(counts[1]), np.arange(counts[2], len(cases[3])))
-            again = Cases(cases[3][rows], names, cases[4][rows], rows, Separation(*cases[:3]), np.zeros(6))
+            shift, covariance, off, prior, called, _ = (each[rows] for each in cases)
+            again = Cases(prior, names, called, Separation(shift, covariance, off))
             since = Doubts((as_uncertain_again(again),), SIGMA_INFLATION).levels(risk - left_out)
         else:
             unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)

@@ -253,12 +253,9 @@ def absolute_level(cases: Gathered, count: int, alike: Array, farther: Array, li
     """
     shift, covariance, off, prior, called, _ = cases
     risk, inflation, near, squares, spacing, guide, step = limits
-    table, every, nothing = np.empty((7, count)), np.arange(count), np.zeros((6, 6))
-    start = len(every[:0])  # for a literal 0 numba compiles once more
-    doubted(
-        shift, covariance, off, every, prior[:count], np.zeros(6), nothing, alike, farther, inflation,
-        risk / max(count, 1), table, start,
-    )  # fmt: skip
+    table, start = np.empty((7, count)), len(prior[:0])  # for a literal 0 numba compiles once more
+    share = risk / max(count, 1)
+    doubted(shift, covariance, off, prior[:count], alike, farther, inflation, share, table, start)
     position, rotation, number = levels(
         table[0], table[1:3], table[3:5], table[5:7], risk, near, squares, spacing, guide, step
     )  # fmt: skip
@@ -280,7 +277,6 @@ def level_of_motion(
     true = usual if by_truth else none
     count = now + (here if by_truth else 0) + (2 if unwatched > 0.0 else 1) * (last - ever)
     table, names, at = np.empty((7, count)), np.empty(count, np.intp), len(none)
-    every, nowhere, nothing = np.arange(last), np.zeros(6), np.zeros((6, 6))
     staying: Array = none
     for part in range(5):
         low, high, times, staying, truth, odds = 0, here, 1.0, none, true, 0.0
@@ -300,9 +296,9 @@ def level_of_motion(
             names[at + r] = called[low + r]
             priors[r] *= times if part != 2 or which[low + r] > 0 else 0.0
         moved(
-            shift, covariance, off, every[low:high], priors, nowhere, nothing, which[low:high], from_shift,
-            from_covariance, from_off, lever, by_motion, travel, origin, tcp, stays_at, staying, truth, spread, odds,
-            inflation, risk / max(count, 1), table, at,
+            shift[low:high], covariance[low:high], off[low:high], priors, which[low:high], from_shift, from_covariance,
+            from_off, lever, by_motion, travel, origin, tcp, stays_at, staying, truth, spread, odds, inflation,
+            risk / max(count, 1), table, at,
         )  # fmt: skip
         at += high - low
     position, rotation, number = levels(

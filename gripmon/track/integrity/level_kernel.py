@@ -74,10 +74,7 @@ def doubted(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     alike: Array,
     farther: Array,
     inflation: float,
@@ -85,26 +82,17 @@ def doubted(
     table: Array,
     first: int,
 ) -> None:
-    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of the fits ``rows`` (r,), and, where it is
-    more than a ``share``, how far they are from the pose ``away`` (6,), position and rotation, each ``farther`` (2,),
-    and the tails of their errors: sigma twice and factor twice.
-
-    ``shift`` (h, 6), ``covariance`` (h, 6, 6), to which ``more`` (6, 6) is added, and errors by the model ``off``
-    (h, f, 6), with those that all have, ``alike`` (p, 6).
+    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of fits, and, where it is more than a
+    ``share``, how far they are away, ``shift`` (r, 6), position and rotation, each ``farther`` (2,), and the tails of
+    their errors, sigma twice and factor twice: by ``covariance`` (r, 6, 6) and errors by the model ``off`` (r, f, 6),
+    with those that all have, ``alike`` (p, 6).
     """
-    apart, spread = np.empty(6), np.empty((6, 6))
-    for r in range(len(rows)):
-        h, number = rows[r], first + r
-        table[0, number] = prior[r]
-        if prior[r] <= share:
-            continue
-        for i in range(6):
-            apart[i] = shift[h, i] - away[i]
-            for j in range(6):
-                spread[i, j] = covariance[h, i, j] + more[i, j]
-        _enter(apart, spread, off[h], alike, inflation, table, number)
-        for part in range(2):
-            table[1 + part, number] += farther[part]
+    for r in range(len(prior)):
+        table[0, first + r] = prior[r]
+        if prior[r] > share:
+            _enter(shift[r], covariance[r], off[r], alike, inflation, table, first + r)
+            for part in range(2):
+                table[1 + part, first + r] += farther[part]
 
 
 @compiled
@@ -316,10 +304,7 @@ def moved(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     which: Ints,
     from_shift: Array,
     from_covariance: Array,
@@ -352,37 +337,30 @@ def moved(
     """
     parts, kinds = off.shape[1], len(by_motion)
     errors = parts + kinds * kinds + kinds
-    apart, spread, half, none = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.zeros((0, 6))
+    half, none = np.empty((6, 6)), np.zeros((0, 6))
     way, scatter, error = np.empty(6), np.empty((6, 6)), np.empty((errors, 6))
     joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((5, 6, 6))
     exact, true_way, unsure = np.zeros((errors, 6)), np.empty(6), np.empty((6, 6))
-    before = -1
-    for r in range(len(rows)):
-        h, g, number = rows[r], which[r], first + r
+    for r in range(len(prior)):
+        g, number = which[r], first + r
         table[0, number] = prior[r]
         if prior[r] <= share:
             continue
-        if h != before:
-            for i in range(6):
-                apart[i] = shift[h, i] - away[i]
-                for j in range(6):
-                    spread[i, j] = covariance[h, i, j] + more[i, j]
-            _levered(spread, lever, half)
-            before = h
+        _levered(covariance[r], lever, half)
         for i in range(6):
-            way[i] = -from_shift[g, i] + apart[i]
+            way[i] = -from_shift[g, i] + shift[r, i]
             for k in range(3, 6):
                 if i < 3:
-                    way[i] += lever[i, k] * apart[k]
+                    way[i] += lever[i, k] * shift[r, k]
             for j in range(6):
                 scatter[i, j] = half[i, j] + from_covariance[g, i, j]
         for f in range(parts):
             for i in range(6):
-                error[f, i] = -from_off[g, f, i] + off[h, f, i]
-            if off[h, f].any():
+                error[f, i] = -from_off[g, f, i] + off[r, f, i]
+            if off[r, f].any():
                 for i in range(3):
                     for k in range(3, 6):
-                        error[f, i] += lever[i, k] * off[h, f, k]
+                        error[f, i] += lever[i, k] * off[r, f, k]
         of_motion = way
         if len(usual):
             knocked = _stayed(way, scatter, error[:parts], stays_at, usual, knock, odds, true_way, unsure, work)

@@ -151,32 +151,25 @@ def bounds(covariance: Array, risk: Array) -> Array:
 
 class Cases(NamedTuple):
     """Things that may be wrong with a published pose, r of them: the ``name`` that each is ``called`` (r,) by, its
-    ``prior`` (r,), and which ``rows`` (r,) of the ``fits`` is the one under it.  The fits count from a pose that the
-    published one is ``away`` (6,) from, and the covariance ``more`` (6, 6) comes on top.  ``alike`` (p, 6): errors by
-    the model that all have, by their standard deviations; ``farther`` (2,): what is added to their distances, m and
-    rad.
+    ``prior`` (r,), and the ``fits`` under them as shifts from that pose.  ``alike`` (p, 6): errors by the model that
+    all have, by their standard deviations; ``farther`` (2,): what is added to their distances, m and rad.
     """
 
     prior: Array
     name: tuple[str, ...]
     called: NDArray[np.intp]
-    rows: NDArray[np.intp]
     fits: Separation
-    away: Array
-    more: Array = np.zeros((6, 6))
     alike: Array = np.zeros((0, 6))
     farther: Array = np.zeros(2)
 
     @classmethod
     def of(cls, name: tuple[str, ...], prior: Array, fits: Separation) -> Cases:
-        """``fits`` with shifts (h, 6) from the published pose."""
-        every = np.arange(len(prior))
-        return cls(prior, name, every, every, fits, np.zeros(6))
+        """Each by its own name."""
+        return cls(prior, name, np.arange(len(prior)), fits)
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.doubted`."""
-        of = *self.fits, self.rows, self.prior, self.away, self.more, self.alike, self.farther
-        level_kernel.doubted(*of, inflation, share, table, first)
+        level_kernel.doubted(*self.fits, self.prior, self.alike, self.farther, inflation, share, table, first)
 
 
 class Moved(NamedTuple):
@@ -204,11 +197,9 @@ class Moved(NamedTuple):
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.moved`."""
-        prior, _, _, rows, fits, away, more, *_ = self.cases
-        since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
-        true = self.usual, self.knock, self.odds
-        of = *fits, rows, prior, away, more, self.which, *self.begun, *since
-        level_kernel.moved(*of, *true, inflation, share, table, first)
+        _, cases, which, begun, *since = self
+        of = *cases.fits, cases.prior, which, *begun, *since
+        level_kernel.moved(*of, inflation, share, table, first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -201,10 +201,7 @@ def doubted(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     alike: Array,
     farther: Array,
     inflation: float,
@@ -212,8 +209,8 @@ def doubted(
     table: Array,
     first: int,
 ) -> None:
-    every = np.broadcast_to(alike, (len(rows), *alike.shape))
-    fits = shift[rows] - away, covariance[rows] + more, np.concatenate([off[rows], every], axis=1)
+    every = np.broadcast_to(alike, (len(prior), *alike.shape))
+    fits = shift, covariance, np.concatenate([off, every], axis=1)
     enter(table, first, prior, share, tails(*fits, inflation), farther)
 
 
@@ -252,10 +249,7 @@ def moved(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     which: Ints,
     from_shift: Array,
     from_covariance: Array,
@@ -275,9 +269,9 @@ def moved(
     table: Array,
     first: int,
 ) -> None:
-    way = (shift[rows] - away) @ lever.T - from_shift[which]
-    spread = lever @ (covariance[rows] + more) @ lever.T + from_covariance[which]
-    errors = [off[rows] @ lever.T - from_off[which]]
+    way = shift @ lever.T - from_shift[which]
+    spread = lever @ covariance @ lever.T + from_covariance[which]
+    errors = [off @ lever.T - from_off[which]]
     true_way = way
     if len(usual):
         whole = spread + np.einsum("rfi,rfj->rij", errors[0], errors[0])
@@ -415,8 +409,8 @@ def gathered(
 
 def absolute_level(cases: tuple, count: int, alike: Array, farther: Array, limits: tuple) -> tuple[float, float, int]:
     shift, covariance, off, prior, called, _ = cases
-    name, rows, fits = tuple(map(str, called)), np.arange(count), Separation(shift, covariance, off)
-    of = Cases(prior[:count], name, rows, rows, fits, np.zeros(6))
+    fits = Separation(shift[:count], covariance[:count], off[:count])
+    of = Cases.of(tuple(map(str, called)), prior[:count], fits)
     return bound((of._replace(alike=alike, farther=farther),), limits)
 
 
@@ -436,8 +430,8 @@ def level_of_motion(
 
     def of_motion(rows: range, times: float, staying: Array, **true: object) -> Moved:
         some = np.array(rows, np.intp)
-        of = prior[some] * times, name, some, some, Separation(shift, covariance, off), np.zeros(6)
-        return Moved(of[0], Cases(*of), which[some], *since, staying, **true)
+        of = Cases(prior[some] * times, name, some, Separation(shift[some], covariance[some], off[some]))
+        return Moved(of.prior, of, which[some], *since, staying, **true)
 
     by_truth, lasts = len(first[2]) > 1 and not moves, range(ever, len(prior))
     true = {"usual": usual} if by_truth else {}
