@@ -19,14 +19,7 @@ from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
 from gripmon.monitor.anchor import Anchor
-from gripmon.monitor.bounds import (
-    SIGMA_INFLATION,
-    as_uncertain_again,
-    larger,
-    protection_of,
-    reaching,
-    unbounded,
-)
+from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits, in_the_references_frames
@@ -37,12 +30,7 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Cases, Doubts, Knocks, Mount, Separation, bounds
-from gripmon.track.integrity.frame_kernel import (
-    Bound,
-    absolute_level,
-    gathered,
-    level_of_motion,
-)
+from gripmon.track.integrity.frame_kernel import Bound, absolute_level, gathered, level_of_motion
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY, least_known
 from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, QUANTILES
