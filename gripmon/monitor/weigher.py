@@ -266,7 +266,7 @@ class Weigher:
         anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
         doubts, ends, risk = fits.doubted(prior), fits.hypotheses.ends, self._policy.integrity_risk
         none, names, solved = tuple(each[:0] for each in fits.alone), fits.hypotheses.name, prior
-        bare = none, (prior[:0], *(each[:0] for each in doubts[1:]))
+        bare = none, (prior[:0], doubts[1][:0], doubts[2][:0])
         if without is fits:  # then that of the ends is the same as that nothing is wrong
             solved = prior * (np.arange(len(prior)) != ends)
         elif without is not None:
@@ -290,8 +290,9 @@ class Weigher:
         differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if first is None or differences is None:  # this frame is the first one
             rows = np.append(np.arange(counts[1]), np.arange(counts[2], len(cases[3])))
-            shift, covariance, off, prior, called, _ = (each[rows] for each in cases)
-            again = Cases(prior, names, called, Separation(shift, covariance, off))
+            shift, covariance, off, prior, called, _ = cases
+            fits_there = Separation(shift[rows], covariance[rows], off[rows])
+            again = Cases(prior[rows], names, called[rows], fits_there)
             since = Doubts((as_uncertain_again(again),), SIGMA_INFLATION).levels(risk - left_out)
         else:
             unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)

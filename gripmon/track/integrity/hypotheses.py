@@ -62,8 +62,8 @@ class Hypotheses:
         """Of :meth:`without_ends` those that doubt something else, and the one that doubts no more than the ends."""
         some = self.more_than_ends | (np.arange(len(self.prior)) == self.ends)
         names = tuple(name for name, kept in zip(self.name, some, strict=True) if kept)
-        rows = (each[some] for each in (self.prior, self.keep, self.opening, self.sudden))
-        return Hypotheses(names, *rows, ends=int(some[: self.ends].sum()))
+        of_each = self.prior[some], self.keep[some], self.opening[some], self.sudden[some]
+        return Hypotheses(names, *of_each, int(some[: self.ends].sum()))
 
 
 def hypotheses_of(

@@ -22,6 +22,7 @@ from scipy.special import chdtri
 
 from gripmon.model.records import Array
 from gripmon.track.integrity import frame_kernel, kernel, level_kernel
+from gripmon.track.integrity.knocks import Knocks, least_known
 
 LEVEL_TOLERANCE_RATIO = 1.02
 """Factor within which a protection level is found; the larger end counts."""
@@ -197,9 +198,9 @@ class Moved(NamedTuple):
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.moved`."""
-        _, cases, which, begun, *since = self
-        of = *cases.fits, cases.prior, which, *begun, *since
-        level_kernel.moved(*of, inflation, share, table, first)
+        of = *self.cases.fits, self.cases.prior, self.which, *self.begun
+        since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
+        level_kernel.moved(*of, *since, self.usual, self.knock, self.odds, inflation, share, table, first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +250,7 @@ def warm_up() -> None:
         made = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
         _, at, fits, _, _ = refitted(*made, 1.0)
     follow(fits, fits, none)
+    Knocks.of(least_known(np.eye(6), np.ones(3), 0.0))
     told = with_known(fits, none, np.eye(6))
     motion = frame_kernel.begun(here, here, here, *fits, np.eye(6))[0]
     frame_kernel.motion_since(here, here, here)
