@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
 from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
 from gripmon.monitor.since import AtReference, Opened
-from gripmon.track.integrity import bounds, hypotheses_of
+from gripmon.track.integrity import Cases, Separation, bounds, hypotheses_of, with_known
+from gripmon.track.integrity.kernel import telling
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 SAID = tuple(f"edge {name}" for name in NAMES)
@@ -91,7 +93,12 @@ def averaged(frames: list[Frame], creep: np.ndarray = STILL) -> Anchor:
 
 
 def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray = STILL) -> float:
-    cases, _ = anchor.cases(frame.cam_T_grip, frame, ROWS, wander, LASTING.priors(SURE))
+    average, from_T, origin_T, origin = anchor.known
+    at, way = perturbation_between(from_T, frame.cam_T_grip), wander / SIGMA_INFLATION**2
+    own = frame.shifts(frame.cam_T_grip), frame.covariance, frame.of_model
+    told = Separation(*telling(*average, at, way, *own, ROWS, CONTRADICTION_SQUARE))
+    known = with_known(told, perturbation_between(frame.cam_T_grip, origin_T), origin + np.diag(way))
+    cases = Cases.of(LASTING.name, LASTING.priors(SURE), known)
     return NOTHING_COMMON.absolute([cases], frame.cam_T_grip).levels(risk)[0]
 
 

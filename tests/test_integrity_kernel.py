@@ -11,10 +11,10 @@ from support.by_numpy import integrity as by_numpy
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
-from gripmon.monitor import Monitor
+from gripmon.monitor import Monitor, weigher
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.track.integrity import Cases, Doubts, Separation, kernel, level_kernel, separation
+from gripmon.track.integrity import Cases, Doubts, Separation, frame_kernel, kernel, level_kernel, separation
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
@@ -77,12 +77,6 @@ def test_fits_are_those_of_numpy(m: int, seed: int):
     anchor = shifts(rng, 1)[0], covariances(rng, 1)[0]
     for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
         agree(kernel.with_pose(*sums, *anchor, off), by_numpy.with_pose(*sums, *anchor, off), 1.0 / SIZE)
-        one, other = (by.with_and_without(*of, *anchor, off, 1.44, True) for by in (kernel, by_numpy))
-        for found, expected in zip(one[:2], other[:2], strict=True):
-            agree(found, expected)
-        alone, none, squares = kernel.with_and_without(*of, *anchor, off, 1.44, False)
-        assert all(map(np.array_equal, (*alone, squares), (*one[0], one[2]))) and not any(map(len, none))
-        np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -116,19 +110,22 @@ def test_a_frames_refits_are_those_of_numpy(m: int):
     for found, numpys in zip(one[2:], other[2:], strict=True):
         agree(found, numpys)
     np.testing.assert_allclose(squares, expected, rtol=1e-8)
+    *_, alone, none, same = kernel.refitted(*of, 1.44, False)
+    assert all(map(np.array_equal, (*alone, same), (*one[2], squares))) and not any(map(len, none))
 
 
 def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | None) -> tuple[np.ndarray, np.ndarray]:
     """(7, n) each, compiled and NumPy's, of some fits of a pose and some of the motion since."""
-    frame, first, away = fits(rng), fits(rng), shifts(rng, 1)[0]
-    rows, prior = rng.integers(0, HYPOTHESES, 9), 10.0 ** rng.uniform(-4.0, 0.0, 9)
+    frame, first, prior = fits(rng, 9), fits(rng), 10.0 ** rng.uniform(-4.0, 0.0, 9)
     poses = [perturb(AT_T, 10.0 * xi) for xi in shifts(rng, 3)]
-    lever, turn, *_ = made = level_kernel.motion_since(*poses)
-    for one, other in zip(made, by_numpy.motion_since(*poses), strict=True):
+    for one, other in zip(frame_kernel.motion_since(*poses), by_numpy.motion_since(*poses), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-14)
-    since = first.shift, first.covariance, first.of_model, lever, turn, covariances(rng, 1)[0]
-    agree(level_kernel.begun(*since), by_numpy.begun(*since))
-    of = *frame, rows, prior, away, 0.1 * covariances(rng, 1)[0]
+    since = *poses, *first, covariances(rng, 1)[0]
+    (made, lever, *places), (begun, *others) = frame_kernel.begun(*since), by_numpy.begun(*since)
+    agree(made, begun)
+    for one, other in zip((lever, *places), others, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-14)
+    of = *frame, prior
     by_motion, places = 0.1 * rng.normal(size=(kinds, 6, 3)), 0.1 * rng.normal(size=(2, 3))
     motion = by_motion, shifts(rng, 1)[0], places[0], places[1], shifts(rng, 1)[0]
     known = 5.0 * covariances(rng, 1)[0] if staying else np.zeros((0, 6))
@@ -138,7 +135,6 @@ def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | No
     found = np.full((2, 7, 20), np.nan)
     for by, table in zip((level_kernel, by_numpy), found, strict=True):
         by.doubted(*of, alike, farther, 1.2, 1e-2, table, 0)
-        begun = by_numpy.begun(*since)
         by.moved(*of, which, *begun, lever, *motion, known, *true, 1.2, 1e-2, table, 10)
     return found[0], found[1]
 
@@ -160,15 +156,18 @@ def test_jumps_are_those_of_numpy(seed: int):
     frame, at, known, jumps = fits(rng), shifts(rng, 1)[0], covariances(rng, 1)[0], 3.0 * covariances(rng, 4)
     prior, stays = rng.uniform(0.0, 0.2, (HYPOTHESES, 4)), rng.uniform(size=HYPOTHESES) < 0.6
     for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
-        of = *frame, at, known, off, jumps, prior, stays, 1.44
-        np.testing.assert_allclose(kernel.jumped(*of), by_numpy.jumped(*of), rtol=1e-8)
+        of = *frame, at, known, off, jumps, 0.1 * prior, stays, 1.44
+        exact, more = (kernel.jumped(*of, np.full(HYPOTHESES, enough)) for enough in (0.0, 0.5))
+        for found, enough in ((exact, 0.0), (more, 0.5)):
+            np.testing.assert_allclose(found, by_numpy.jumped(*of, np.full(HYPOTHESES, enough)), rtol=1e-8)
+        assert (more >= (1.0 - 1e-9) * exact).all() and (more > 1.1 * exact).any(), "never less than they are"
         fit, jump = rng.integers(0, HYPOTHESES, 9), rng.integers(0, 4, 9)
         after = *frame, at, known, off, jumps, fit, jump, rng.uniform(size=9), 0.5
         agree(kernel.after_jumps(*after), by_numpy.after_jumps(*after))
         share, along = np.array([0.4, 0.3, 0.2, 0.1]), np.array([False, False, True, True])
-        weights, endless = 10.0 ** rng.uniform(-4.0, 0.0, (2, HYPOTHESES)), rng.uniform(size=HYPOTHESES) < 0.5
-        weights[0, 2] = 0.0
-        of = *frame, at, known, off, jumps, share, along, *weights, stays, endless, 1e-3, 1.44
+        weight, endless = 10.0 ** rng.uniform(-4.0, 0.0, HYPOTHESES), rng.uniform(size=HYPOTHESES) < 0.5
+        weight[2] = 0.0
+        of = *frame, at, known, off, jumps, share, along, weight, 0.01, 0.3, stays, endless, 1e-3, 1.44
         (fit, jump, weight, left), (fits_, jumps_, expected, rest) = kernel.knocked(*of), by_numpy.knocked(*of)
         assert 0 < len(fit) < 4 * HYPOTHESES and fit.tolist() == fits_.tolist() and jump.tolist() == jumps_.tolist()
         np.testing.assert_allclose(np.append(weight, left), np.append(expected, rest), rtol=1e-8)
@@ -235,11 +234,8 @@ def test_what_has_no_root_is_inverted_all_the_same():
     of = *average, none, none, *Separation(frame.shift, 1e3 * frame.covariance, frame.of_model), rows, 12.0
     agree(kernel.telling(*of), by_numpy.telling(*of))
     anchor = shifts(rng, 1)[0], -covariances(rng, 1)[0], of_the_model(rng, 1)[0]
-    of = *normal_equations(rng, 7), *anchor, 1.0, True
-    one, other = kernel.with_and_without(*of), by_numpy.with_and_without(*of)
-    for found, expected in zip(one[:2], other[:2], strict=True):
-        agree(found, expected)
-    np.testing.assert_allclose(one[2], other[2], rtol=1e-8)
+    of = *by_numpy.add_up(*normal_equations(rng, 7)), *anchor
+    agree(kernel.separate(*kernel.with_pose(*of), 6), by_numpy.separate(*by_numpy.with_pose(*of), 6))
 
 
 def fractions(numbers: np.ndarray) -> np.ndarray:
@@ -303,6 +299,50 @@ def test_what_determines_nothing_is_an_error():
         kernel.separate(np.zeros((1, 6)), np.zeros((1, 6, 6)), np.zeros((1, 6, 6)), np.zeros((1, 0, 6)), 6)
 
 
+def around(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 4, 4) poses near by."""
+    return np.stack([perturb(AT_T, xi) for xi in shifts(rng, count)])
+
+
+@pytest.mark.parametrize("kinds", [0, 3])
+@pytest.mark.parametrize("displaced", [False, True])
+@pytest.mark.parametrize("unwatched", [0.0, 1e-3])
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatched: float, bare: bool):
+    rng = np.random.default_rng(kinds + 10 * displaced)
+    cam_T_grip, fit_T, from_T, origin_T = around(rng, 4)
+    alone, anchored, first, count = fits(rng), fits(rng), fits(rng, 5), HYPOTHESES
+    floor, known, origin, usual = 0.1 * covariances(rng, 4)
+    prior, some = 10.0 ** rng.uniform(-5.0, -1.0, (3, count)), rng.uniform(size=(4, count)) < 0.7
+    prior[0, 0] = 1.0
+    wander, axis = rng.uniform(size=6) * SIZE[:6] ** 2, rng.normal(size=3)
+    frame = fit_T, tuple(alone), tuple(anchored), alone.covariance + floor, floor
+    few = count if bare else 0
+    besides = tuple(fits(rng, few)), (prior[2, :few], some[2, :few], some[3, :few])
+    before = shifts(rng, 1)[0], known, of_the_model(rng, 1)[0]
+    many = 0 if displaced else 5
+    lasting = tuple(fits(rng, many)), from_T, origin_T, origin, wander, rng.integers(-1, count, many), prior[1, :many]
+    of = frame, (prior[0], *some[:2]), prior[0] * some[3], besides, before, (axis, count - 1, 0.5, 1e-3, 0.1)
+    of = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-5, 1e-7, 1.44
+    cases, counts, spread, left = frame_kernel.gathered(*of)
+    expected, numbers, knock, out = by_numpy.gathered(*of)
+    probable = expected[3] > 1e-6
+    assert counts == numbers and probable.any() and len(cases[3]) == len(probable)
+    agree([each[probable] for each in cases], [each[probable] for each in expected])
+    agree((spread, left), (knock, out))
+    limits = 1e-5 - left, 1.2, 1.02, *QUANTILES
+    common, tilt = (of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])), 0.1 * rng.normal(size=(kinds, 6, 3))
+    since = tuple(first), np.eye(6), tilt, shifts(rng, 1)[0], *(0.1 * rng.normal(size=(2, 3))), shifts(rng, 1)[0]
+    for moves in (displaced, True):
+        of = cases, counts, spread, since, (usual, moves, unwatched, 1e-4), limits
+        one, other = frame_kernel.level_of_motion(*of), by_numpy.level_of_motion(*of)
+        assert one[2] == other[2] >= 0
+        np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+    one, other = (by.absolute_level(cases, counts[2], *common, limits) for by in (frame_kernel, by_numpy))
+    assert one[2] == other[2] >= 0
+    np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+
+
 KNOCKED_AT = 15  # frame
 
 
@@ -310,6 +350,8 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
     """Of the demo's camera over half a second, with a knock in the middle."""
     monkeypatch.setattr(separation, "kernel", by)
     monkeypatch.setattr(separation, "level_kernel", level_kernel if by is kernel else by)
+    for name in ("gathered", "absolute_level", "level_of_motion"):
+        monkeypatch.setattr(weigher, name, getattr(frame_kernel if by is kernel else by, name))
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))

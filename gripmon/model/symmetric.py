@@ -17,9 +17,9 @@ def diagonalise(matrix: Array, vectors: Array) -> None:
     ``vectors`` (n, n) the eigenvectors as columns.
     """
     count = len(matrix)
-    vectors[:] = 0.0
     for i in range(count):
-        vectors[i, i] = 1.0
+        for j in range(count):
+            vectors[i, j] = 1.0 if i == j else 0.0
     for _ in range(JACOBI_SWEEPS):
         rest, whole = 0.0, 0.0
         for i in range(count):

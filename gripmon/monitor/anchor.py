@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
-from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
 from gripmon.monitor.bounds import SIGMA_INFLATION, protection_of
 from gripmon.monitor.refits import Refits
 from gripmon.monitor.since import FIRST_FRAMES
-from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, follow, telling, with_known
+from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, follow, with_known
+from gripmon.track.integrity.frame_kernel import Fits
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
@@ -199,32 +199,20 @@ class Anchor:
         """The protection level of the average itself."""
         fits = self._with_origin(self.fits(), self.cam_T_grip)
         cases = Cases.of(self._lasting.name, self._lasting.priors(self.misread), fits)
-        return protection_of(Doubts((cases,), SIGMA_INFLATION), risk)
+        return protection_of(Doubts((cases,), SIGMA_INFLATION).levels(risk), risk)
 
-    def _with_origin(self, fits: Separation, at_T: Array, wander: Array | None = None) -> Separation:
-        """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before, a motion of variances
-        ``wander`` (6,) ago.
-        """
+    def _with_origin(self, fits: Separation, at_T: Array) -> Separation:
+        """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before."""
         origin_T, covariance = self._origin
-        covariance = covariance if wander is None else covariance + np.diag(wander)
         return with_known(fits, perturbation_between(at_T, origin_T), covariance)
 
-    def cases(
-        self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array, prior: Array
-    ) -> tuple[Cases, Cases]:
-        """The lasting hypotheses, of a ``prior`` (g,), about a pose (4, 4) from a frame's ``fits``, ``rows`` (g,) of
-        them, and the same by what is known without the origin; ``wander`` (6,): variance of the motion since the
-        anchor.
-
-        Under each hypothesis the average or the frame counts, whichever is more certain; the frame where they differ.
-        What neither shows is known as it was at the origin.
+    @property
+    def known(self) -> tuple[Fits, Array, Array, Array]:
+        """The averages under the lasting hypotheses, the pose (4, 4) that they count from, and where the gripper was
+        before, (4, 4), with the covariance (6, 6) of that.
         """
-        at, wander = perturbation_between(self._base_T, cam_T_grip), wander / SIGMA_INFLATION**2
-        frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
-        average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
-        told = telling(average, at, wander, frame, rows, CONTRADICTION_SQUARE)
-        name, with_origin = self._lasting.name, self._with_origin(told, cam_T_grip, wander)
-        return Cases.of(name, prior, with_origin), Cases.of(name, prior, told)
+        average = self._filters.shift, self._claimed, self._filters.of_model
+        return average, self._base_T, *self._origin
 
 
 def average_of(base_T: Array, frames: Sequence[tuple[Refits, NDArray[np.intp]]], play: Array) -> Separation:

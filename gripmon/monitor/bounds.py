@@ -45,18 +45,21 @@ class ModelError(NamedTuple):
         first, reference_T = self.first
         return None if first is None else first.differences(cam_T_grip, reference_T, opened, self.common, swing)
 
+    def alike(self, cam_T_grip: Array) -> tuple[Array, Array]:
+        """What all fits near a pose (4, 4) are off by: by standard deviations (p, 6), and by these lengths (2,)."""
+        common = self.common
+        return (np.zeros((0, 6)), np.zeros(2)) if common is None else (common.alike(cam_T_grip), common.farther)
+
     def absolute(self, sets: Iterable[Cases], cam_T_grip: Array) -> Doubts:
         """The doubts about a pose (4, 4), with what is common to all of them."""
-        if self.common is not None:
-            alike, farther = self.common.alike(cam_T_grip), self.common.farther
-            sets = (each._replace(alike=alike, farther=farther) for each in sets)
-        return Doubts(tuple(sets), SIGMA_INFLATION)
+        alike, farther = self.alike(cam_T_grip)
+        return Doubts(tuple(each._replace(alike=alike, farther=farther) for each in sets), SIGMA_INFLATION)
 
 
 def as_uncertain_again(cases: Cases) -> Cases:
     """Of the motion since the reference, while this frame is the first one."""
-    fits = Separation(cases.fits.shift, 2.0 * cases.fits.covariance, np.zeros((len(cases.fits.shift), 0, 6)))
-    return cases._replace(fits=fits, more=2.0 * cases.more)
+    shift, covariance, _ = cases.fits
+    return cases._replace(fits=Separation(shift, 2.0 * covariance, np.zeros((len(shift), 0, 6))))
 
 
 def unbounded(risk: float, why: str) -> Bounds:
@@ -65,14 +68,10 @@ def unbounded(risk: float, why: str) -> Bounds:
     return Bounds(none, none)
 
 
-def protection_of(doubts: Doubts, risk: float, left_out: float = 0.0) -> Protection:
-    """The protection levels at an integrity ``risk``, of which what isn't among the doubts takes the part ``left_out``;
-    where that is more than half of it, there is no bound.
-    """
-    if left_out > 0.5 * risk:
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "too much may be wrong at once")
-    position_m, rotation_rad, name = doubts.levels(risk - left_out)
-    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, name)
+def protection_of(levels: tuple[float, float, str], risk: float) -> Protection:
+    """The protection levels, m and rad, at an integrity ``risk``, with the name of what the position's owes most to."""
+    position_m, rotation_rad, hypothesis = levels
+    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, hypothesis)
 
 
 def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:

@@ -37,12 +37,13 @@ MOST_KEPT = 64
 
 
 class About(NamedTuple):
-    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, and
-    ``rows`` (g,), which hypothesis each lasting one is.
+    """What may be wrong with a fit of some seen edges: the ``hypotheses``, the same ``without_ends`` besides, ``pairs``
+    of these that doubt more than the ends, and ``rows`` (g,), which hypothesis each lasting one is.
     """
 
     hypotheses: Hypotheses
     without_ends: Hypotheses
+    pairs: Hypotheses
     rows: NDArray[np.intp]
 
 
@@ -77,7 +78,9 @@ class Possible:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
             hypotheses = self.hypotheses(edges)
-            self._kept[key] = About(hypotheses, hypotheses.without_ends(), self.lasting.rows(hypotheses, edges))
+            without = hypotheses.without_ends()
+            rows = self.lasting.rows(hypotheses, edges)
+            self._kept[key] = About(hypotheses, without, without.pairs(), rows)
         return self._kept[key]
 
 
@@ -155,4 +158,4 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     cases = fits.cases(fits.away(cam_T_grip), hypotheses.prior, ~hypotheses.sudden)
     absolute, risk = possible.model.absolute([cases], cam_T_grip), settings.policy.integrity_risk
     since = Doubts((as_uncertain_again(cases),), SIGMA_INFLATION)
-    return Bounds(protection_of(absolute, risk), protection_of(since, risk))
+    return Bounds(protection_of(absolute.levels(risk), risk), protection_of(since.levels(risk), risk))

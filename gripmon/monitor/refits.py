@@ -14,7 +14,8 @@ from gripmon.model.records import Array
 from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
 from gripmon.monitor.since import Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
-from gripmon.track.integrity import Cases, Hypotheses, Knocked, Knocks, Separation, after_knocks, knocked, refitted
+from gripmon.track.integrity import Cases, Hypotheses, Separation, refitted
+from gripmon.track.integrity.frame_kernel import Doubted, Fits, Frame
 
 
 @cache
@@ -24,7 +25,7 @@ def _vague(m: int) -> Array:
 
 
 @cache
-def _in_the_references_frames(names: tuple[str, ...]) -> tuple[str, ...]:
+def in_the_references_frames(names: tuple[str, ...]) -> tuple[str, ...]:
     """What lasting hypotheses but the first are called where they hold in those frames alone."""
     return tuple(f"{name}, in the frames of the reference" for name in names[1:])
 
@@ -82,7 +83,8 @@ class Refits:
             together,
         )
         self._fit_T, self._free = made.fit_T, made.alone
-        self._known = made.at, *before
+        self.before: Fits = made.at, *before
+        """The pose that is known, from the fits' (6,), its covariance (6, 6), and its errors by the model."""
         # The free fit's distance from what is known, in units of both covariances.
         self.anchored = Anchored(made.anchored, made.square)
         self.stays: NDArray[np.bool_] = made.square <= CONTRADICTION_SQUARE
@@ -114,40 +116,27 @@ class Refits:
         """(6,) where a published pose (4, 4) is from the one that the fits count from."""
         return perturbation_between(self._fit_T, cam_T_grip)
 
-    def cases(self, away: Array, prior: Array, chosen: NDArray[np.bool_], anchored: Anchored | None = None) -> Cases:
+    def cases(self, away: Array, prior: Array, chosen: NDArray[np.bool_]) -> Cases:
         """What may be wrong with a published pose, :meth:`away`, under the ``chosen`` hypotheses (h,) of probability
-        ``prior`` (h,), by the frame alone or by the anchor too.
+        ``prior`` (h,), by the frame alone.
         """
-        fits, rows = self._free if anchored is None else anchored.fits, chosen.nonzero()[0]
-        return Cases(prior[rows], self.hypotheses.name, rows, rows, fits, away, self._floor)
+        rows, shift = chosen.nonzero()[0], self._free.shift - away
+        fits = Separation(shift[rows], self.covariance[rows], self.of_model[rows])
+        return Cases(prior[rows], self.hypotheses.name, rows, fits)
 
-    def knocked(self, prior: Array, knocks: Knocks, odds: tuple[float, float], least: float) -> Knocked:
-        """That the mount was knocked since the pose that is known.
+    @property
+    def alone(self) -> Fits:
+        """The fits by the frame alone, of their own errors."""
+        return tuple(self._free)
 
-        ``prior`` (h,): of the hypotheses; ``odds``: of a knock under those that leave an end of a finger, and under the
-        others.  Those less probable than ``least``, given the fits, are left out.
-        """
-        endless = self.hypotheses.endless
-        probable = np.where(endless, odds[1], odds[0])
-        return knocked(
-            self._free, self._known, knocks, prior, probable, self.stays, endless, least, SIGMA_INFLATION**2
-        )
+    @property
+    def frame(self) -> Frame:
+        """As :func:`~gripmon.track.integrity.frame_kernel.gathered` asks for."""
+        return self._fit_T, self.alone, tuple(self.anchored.fits), self.covariance, self._floor
 
-    def after(self, away: Array, knocks: Knocks, of: Knocked, share: float) -> Cases:
-        """What may be wrong with a published pose, :meth:`away`, after such a knock; of no more probable ones than a
-        ``share`` the prior alone counts.
-        """
-        fits, every = after_knocks(self._free, self._known, knocks, of, share), np.arange(len(of.prior))
-        return Cases(of.prior, self.hypotheses.name, of.fit, every, fits, away, self._floor)
-
-    def wrong_at_first(self, lasting: tuple[str, ...], prior: Array, away: Array, anchored: Anchored | None) -> Cases:
-        """Of the motion since the reference's frames: one of the lasting hypotheses but the first, by name and of a
-        ``prior`` (g,), held in those, and no longer does.  ``anchored``: None where the published pose, :meth:`away`,
-        rests on the frame alone.
-        """
-        fits, every = self._free if anchored is None else anchored.fits, np.arange(len(lasting) - 1)
-        name = _in_the_references_frames(lasting)
-        return Cases(prior[1:], name, every, np.zeros_like(every), fits, away, self._floor)
+    def doubted(self, prior: Array) -> Doubted:
+        """Likewise, of a ``prior`` (h,)."""
+        return prior, self.stays, self.hypotheses.endless
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

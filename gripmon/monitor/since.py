@@ -38,7 +38,8 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.common import CommonError
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Cases, Moved, Separation, begun, motion_since
+from gripmon.track.integrity import Cases, Moved, Separation
+from gripmon.track.integrity.frame_kernel import begun, motion_since
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -217,19 +218,19 @@ class AtReference(NamedTuple):
         """How fits near a published pose (4, 4) differ from that of exp(d) reference; ``swing`` (6,): variances by
         which a mount that vibrates differs from its average.
         """
-        lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, self.cam_T_grip, reference_T)
         # That each image was at another place is in their average.
         more, travel = np.zeros((6, 6)) if self.of_images else np.diag(swing), np.zeros(6)
+        if common is not None:
+            more = common.of_motion(self.motion(cam_T_grip), self.cam_T_grip) + more
+        first, lever, moved, at, unmoved = begun(cam_T_grip, self.cam_T_grip, reference_T, *self.fits, more)
         by_motion = np.zeros((0, 6, 3))
         if common is not None:
             travel_m = opened.jaw_opening_m - self.jaw_opening_m
-            more = common.of_motion(motion, self.cam_T_grip) + more
             # Of unknown size, lengths are in units of the distance, of which the motion is exact.
             size = common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0
             travel = size * travel_m * (lever @ opened.pose_rate)
             by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
-        first = begun(self.fits, lever, turn, more)
-        return Differences(first, lever, by_motion, travel, motion[:3, 3].copy(), at_T[:3, 3].copy(), unmoved)
+        return Differences(Separation(*first), lever, by_motion, travel, moved, at, unmoved)
 
 
 def digest_of(measured_as: tuple[object, ...]) -> str:

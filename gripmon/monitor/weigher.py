@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
@@ -23,16 +22,18 @@ from gripmon.monitor.anchor import Anchor
 from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.possible import Possible
-from gripmon.monitor.refits import Known, Refits
+from gripmon.monitor.refits import Known, Refits, in_the_references_frames
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
 from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Cases, Doubts, Knocked, Knocks, Mount, bounds
+from gripmon.track.integrity import Cases, Doubts, Knocks, Mount, Separation, bounds
+from gripmon.track.integrity.frame_kernel import Bound, absolute_level, gathered, level_of_motion
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
-from gripmon.track.integrity.knocks import KNOCK_UNSEEN_PROBABILITY, least_known
+from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY, least_known
+from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, QUANTILES
 from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
@@ -82,7 +83,8 @@ class Weigher:
         self.question: Question | None = None
         """By how much the first proven pose differed from the expected one; None if it didn't."""
         self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
-        self._axis, self._every = tracker.finger_axis, np.arange(len(self._lasting.name))
+        self._axis = tracker.finger_axis
+        self._along_share = ALONG_OF_ALL if self._axis.any() else 0.0  # of knocks, along the fingers
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
         self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
         self.rebase(reference)
@@ -174,14 +176,12 @@ class Weigher:
         prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
-        knocks, besides = self._knocks(fits, cam_T_grip), odds[1] * prior[hypotheses.ends]
+        besides = odds[1] * prior[hypotheses.ends]
         without = self._without_ends(fits, besides, displaced)
-        wrong = self._knocks_under(fits, without, prior, knocks, odds)
-        stayed = fits.cases(fits.away(cam_T_grip), prior, fits.stays, anchored)
-        both = self._bounds(stayed, wrong, fits, cam_T_grip, displaced, now_s, knocks)
+        both = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
-        made_of = fits if proven or without is None else without
+        made_of = without if without is not None and not proven and (displaced or not self.proved) else fits
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
         # What was taken for the ends when the strips were learnt looks right ever after.
@@ -189,7 +189,7 @@ class Weigher:
         trust = Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         if anchor is None:
             return trust
-        along_unseen = besides * float(knocks.share[knocks.along].sum()) > risk
+        along_unseen = besides * self._along_share > risk
         return self._explained(trust, measurement, cam_T_grip, prior, fits, along_unseen)
 
     def learnt(self, backgrounds: int) -> None:
@@ -250,74 +250,57 @@ class Weigher:
 
     def _bounds(
         self,
-        stayed: Cases,
-        wrong: list[tuple[Refits, Knocked]],
         fits: Refits,
+        without: Refits | None,
+        prior: Array,
+        odds: tuple[float, float],
         cam_T_grip: Array,
         displaced: bool,
         now_s: float,
-        knocks: Knocks,
     ) -> Bounds:
         """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
-        is as known, ``stayed``, and after the knocks that are ``wrong``, with what may have been wrong all along, or in
-        the reference's frames alone.
+        is as known, and after the knocks that the mount may have got since, by the fits and by those ``without`` ends,
+        with what may have been wrong all along, or in the reference's frames alone.  ``prior`` (h,): of the
+        hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
         """
-        risk, anchor, (first, _) = self._policy.integrity_risk, self.anchor, fits.model.first
-        lasting, every = self._lasting, self._every
-        ever, since = list[Cases](), list[tuple[Cases, NDArray[np.intp]]]()
+        anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
+        doubts, ends, risk = fits.doubted(prior), fits.hypotheses.ends, self._policy.integrity_risk
+        none, names, solved = tuple(each[:0] for each in fits.alone), fits.hypotheses.name, prior
+        bare = none, (prior[:0], doubts[1][:0], doubts[2][:0])
+        if without is fits:  # then that of the ends is the same as that nothing is wrong
+            solved = prior * (np.arange(len(prior)) != ends)
+        elif without is not None:
+            of, names = without.hypotheses, names + without.hypotheses.name
+            bare = without.alone, without.doubted(prior[ends] * of.prior * of.more_than_ends)
+        names += lasting.name + in_the_references_frames(lasting.name)
+        rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
+        at_first = prior[:0] if first is None else lasting.priors(first.misread)
+        always = (none, cam_T_grip, *self.expected, wander, rows[:0], prior[:0])
         if anchor is not None and not displaced:
-            rows, prior = self._possible.about(fits.edges).rows, lasting.priors(anchor.misread)
-            absolute, without_origin = anchor.cases(cam_T_grip, fits, rows, self._wander(now_s), prior)
-            ever, since = [absolute], [(without_origin, every)]
-        if first is not None:
-            anchored, prior = None if displaced else fits.anchored, lasting.priors(first.misread)
-            since.append((fits.wrong_at_first(lasting.name, prior, stayed.away, anchored), every[1:]))
-        left_out, count = 0.0, len(stayed.prior) + 2 * len(every)
-        for _, found in wrong:
-            left_out, count = left_out + found.left_out, count + len(found.prior)
-        # Of what isn't probable enough to have a bound, whichever, the prior counts alone.
-        now, share = [stayed], (risk - left_out) / count
-        for of, found in wrong:
-            now.append(of.after(stayed.away, knocks, found, share))
-        of_motion = self._of_motion(now, since, fits, cam_T_grip, knocks, displaced)
-        absolutely = fits.model.absolute([*now, *ever], cam_T_grip)
-        return Bounds(protection_of(absolutely, risk, left_out), protection_of(of_motion, risk, left_out))
-
-    def _of_motion(
-        self,
-        now: list[Cases],
-        lasting: list[tuple[Cases, NDArray[np.intp]]],
-        fits: Refits,
-        cam_T_grip: Array,
-        knocks: Knocks,
-        displaced: bool,
-    ) -> Doubts:
-        """The doubts about the motion since the reference, of what is wrong ``now``, and of what may have been in its
-        frames, with the numbers of the ``lasting`` hypotheses.  Of a mount that vibrates the average of the reference's
-        frames and its place at their stamp differ by that.
-        """
+            always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
+        knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
+        cases, counts, spread, left_out = gathered(
+            cam_T_grip, displaced, fits.frame, doubts, solved, bare, fits.before, knocks, always, at_first, risk,
+            self._least, SIGMA_INFLATION**2,
+        )  # fmt: skip
+        if left_out > 0.5 * risk:
+            return unbounded(risk, "too much may be wrong at once")
+        limits = risk - left_out, SIGMA_INFLATION, LEVEL_TOLERANCE_RATIO, *QUANTILES
+        absolute = absolute_level(cases, counts[2], *fits.model.alike(cam_T_grip), limits)
         differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
-        if differences is None:  # this frame is the first one
-            return Doubts(tuple(map(as_uncertain_again, [*now, *(each for each, _ in lasting)])), SIGMA_INFLATION)
-        first, usual = fits.model.first[0], self._usual_motion
-        moved = displaced or (first is not None and first.knocked)
-        here, *knocked = map(differences.of, now)
-        # Of a mount that creeps, vibrates and plays, and after a knock is where a knock moves it.
-        staying = usual + knocks.spread if moved else usual
-        stayed = [differences.of(each, numbers, staying) for each, numbers in lasting]
-        if first is not None and first.of_images:
-            # Nobody watched the mount from these images on until the first frame.  That nothing is wrong and it was
-            # knocked then is among what is wrong now, which doesn't rest on its staying.
-            odds = [KNOCK_UNSEEN_PROBABILITY * each.prior * (numbers > 0) for each, numbers in lasting]
-            unwatched = [(each._replace(prior=prior), k) for (each, k), prior in zip(lasting, odds, strict=True)]
-            knocked += [differences.of(each, numbers, usual + knocks.spread) for each, numbers in unwatched]
-        if len(differences.by_motion) > 1 and not moved:
-            # A file's tilt is by the true motion, not by what noise in fits looks like: once as of a mount that moves
-            # as usual, and by all that fits show as probably as it was knocked unnoticed since the reference's frames.
-            odds_of_it = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
-            here, *stayed = [each._replace(usual=usual) for each in (here, *stayed)]
-            knocked.append(here._replace(knock=knocks.spread, odds=odds_of_it))
-        return Doubts((here, *knocked, *stayed), SIGMA_INFLATION)
+        if first is None or differences is None:  # this frame is the first one
+            rows = np.append(np.arange(counts[1]), np.arange(counts[2], len(cases[3])))
+            shift, covariance, off, prior, called, _ = cases
+            fits_there = Separation(shift[rows], covariance[rows], off[rows])
+            again = Cases(prior[rows], names, called[rows], fits_there)
+            since = Doubts((as_uncertain_again(again),), SIGMA_INFLATION).levels(risk - left_out)
+        else:
+            unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
+            moves, unwatched = displaced or first.knocked, KNOCK_UNSEEN_PROBABILITY if first.of_images else 0.0
+            mount, begun = (self._usual_motion, moves, unwatched, unnoticed), tuple(differences.begun)
+            of_motion = level_of_motion(cases, counts, spread, (begun, *differences[1:]), mount, limits)
+            since = _named(of_motion, names)
+        return Bounds(protection_of(_named(absolute, names), risk), protection_of(since, risk))
 
     def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
         """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
@@ -348,24 +331,10 @@ class Weigher:
         """
         if not fits.hypotheses.across.any():
             return fits
-        if not displaced and self.proved and besides * WRONG_EDGE <= self._least:
-            return None
-        return fits.under(self._possible.about(fits.edges).without_ends)
-
-    def _knocks_under(
-        self, fits: Refits, without: Refits | None, prior: Array, knocks: Knocks, odds: tuple[float, float]
-    ) -> list[tuple[Refits, Knocked]]:
-        """The knocks that the mount may have got since it was last known, by the fits and by those without the ends.
-        ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
-        """
-        ends = fits.hypotheses.ends
-        if without is fits:  # then that of the ends is the same as that nothing is wrong
-            prior = prior * (np.arange(len(prior)) != ends)
-        found = [(fits, fits.knocked(prior, knocks, odds, self._least))]
-        if without is not None and without is not fits:
-            both = prior[ends] * without.hypotheses.prior * without.hypotheses.more_than_ends
-            found.append((without, without.knocked(both, knocks, odds, self._least)))
-        return found
+        about = self._possible.about(fits.edges)
+        if displaced or not self.proved:
+            return fits.under(about.without_ends)
+        return None if besides * WRONG_EDGE <= self._least else fits.under(about.pairs)
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
@@ -458,7 +427,8 @@ class Weigher:
         else:
             found = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
             doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
-        return past_alert_limit(protection_of(doubts, self._policy.integrity_risk), self._policy) is None
+        risk = self._policy.integrity_risk
+        return past_alert_limit(protection_of(doubts.levels(risk), risk), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
@@ -493,6 +463,11 @@ class Weigher:
 def _contradicts(way: Array, covariance: Array) -> bool:
     """Whether a motion (6,) is larger than its covariance (6, 6) allows."""
     return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
+
+
+def _named(bound: Bound, names: tuple[str, ...]) -> tuple[float, float, str]:
+    position_m, rotation_rad, number = bound
+    return position_m, rotation_rad, names[number] if number >= 0 else ""
 
 
 def _radii(covariance: Array, risk: float) -> list[float]:

@@ -58,6 +58,13 @@ class Hypotheses:
         name = tuple(f"{name}, and what looks like ends" for name in self.name)
         return replace(self, name=name, keep=self.keep * self.keep[self.ends])
 
+    def pairs(self) -> Hypotheses:
+        """Of :meth:`without_ends` those that doubt something else, and the one that doubts no more than the ends."""
+        some = self.more_than_ends | (np.arange(len(self.prior)) == self.ends)
+        names = tuple(name for name, kept in zip(self.name, some, strict=True) if kept)
+        of_each = self.prior[some], self.keep[some], self.opening[some], self.sudden[some]
+        return Hypotheses(names, *of_each, int(some[: self.ends].sum()))
+
 
 def hypotheses_of(
     edge_names: tuple[str, ...],

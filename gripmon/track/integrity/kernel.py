@@ -81,10 +81,12 @@ def square(covariance: Array, values: Array, root: Array, white: Array) -> float
     """
     total = 0.0
     if not _root(covariance, root):
-        solved = np.linalg.solve(covariance, values)
+        inverse = np.linalg.inv(covariance)
         for i in range(len(white)):
-            white[i] = solved[i]
-            total += values[i] * solved[i]
+            white[i] = 0.0
+            for k in range(len(white)):
+                white[i] += inverse[i, k] * values[k]
+            total += values[i] * white[i]
         return total
     for i in range(len(root)):
         rest = values[i]
@@ -112,21 +114,24 @@ def add_up(
     """
     count, (edges, m) = len(keep), pull.shape
     sums, normal, spread = known_pull.copy(), known.copy(), known.copy()
-    of_model = np.zeros((count, parts, m))
+    of_model, kept = np.zeros((count, parts, m)), np.empty(edges, np.intp)
     for h in range(count):
+        number = 0
         for v in range(edges):
             if keep[h, v] == 0.0:
                 continue
+            kept[number], number = v, number + 1
             for i in range(m):
                 sums[h, i] += pull[v, i]
                 for p in range(len(part)):
                     of_model[h, part[p, v], i] += model[p, v, i]
-                for j in range(i + 1):
-                    normal[h, i, j] += information[v, i, j]
-                    spread[h, i, j] += middle[v, i, j]
         for i in range(m):
-            for j in range(i):
-                normal[h, j, i], spread[h, j, i] = normal[h, i, j], spread[h, i, j]
+            for j in range(i + 1):
+                one, other = normal[h, i, j], spread[h, i, j]
+                for k in range(number):
+                    one, other = one + information[kept[k], i, j], other + middle[kept[k], i, j]
+                normal[h, i, j] = normal[h, j, i] = one
+                spread[h, i, j] = spread[h, j, i] = other
     return sums, normal, spread, of_model
 
 
@@ -136,9 +141,10 @@ def _around(matrix: Array, middle: Array, half: Array, out: Array) -> None:
     m = len(matrix)
     for i in range(m):
         for j in range(m):
-            half[i, j] = 0.0
+            total = 0.0
             for k in range(m):
-                half[i, j] += matrix[k, i] * middle[k, j]
+                total += matrix[k, i] * middle[k, j]
+            half[i, j] = total
         for j in range(i + 1):
             total = 0.0
             for k in range(m):
@@ -157,13 +163,17 @@ def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknown
     for h in range(count):
         rooted = _inverse(normal[h], inverse, root, upper)
         for i in range(n):
+            total = 0.0
             for j in range(m):
-                shift[h, i] += inverse[i, j] * sums[h, j]
+                total += inverse[i, j] * sums[h, j]
+            shift[h, i] = total
         for f in range(fingers):
             if of_model[h, f].any():  # most edges of a gripper are seen in no frame
                 for i in range(n):
+                    total = 0.0
                     for j in range(m):
-                        off[h, f, i] += inverse[i, j] * of_model[h, f, j]
+                        total += inverse[i, j] * of_model[h, f, j]
+                    off[h, f, i] = total
         # U (U' spread U) U': multiplied by N^-1 itself, an open direction takes the digits of all others.
         middle, half = spread[h], root
         if rooted:
@@ -171,9 +181,10 @@ def separate(sums: Array, normal: Array, spread: Array, of_model: Array, unknown
             middle = inverse
         for i in range(n):
             for j in range(m):
-                half[i, j] = 0.0
+                total = 0.0
                 for k in range(m):
-                    half[i, j] += upper[i, k] * middle[k, j]
+                    total += upper[i, k] * middle[k, j]
+                half[i, j] = total
             for j in range(i + 1):
                 total = 0.0
                 for k in range(m):
@@ -240,39 +251,6 @@ def squares(shift: Array, at: Array, covariance: Array, off: Array, times: float
 
 
 @compiled
-def with_and_without(
-    pull: Array,
-    information: Array,
-    middle: Array,
-    model: Array,
-    part: Ints,
-    parts: int,
-    keep: Array,
-    known: Array,
-    known_pull: Array,
-    at: Array,
-    covariance: Array,
-    off: Array,
-    times: float,
-    together: bool,
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
-    """The fits' shifts, covariances and errors by the model by the kept edges alone, the same with a pose that is known
-    besides, none of these if they aren't asked for ``together``, and the normalised squares (h,) of the former's
-    distance from that.
-    """
-    sums, normal, spread, of_model = add_up(
-        pull, information, middle, model, part, parts, keep, known, known_pull
-    )  # fmt: skip
-    alone = separate(sums, normal, spread, of_model, 6)
-    asked = len(sums) if together else 0
-    sums, normal, spread, of_model = with_pose(
-        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, covariance, off
-    )  # fmt: skip
-    with_it = separate(sums, normal, spread, of_model, 6)
-    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
-
-
-@compiled
 def refitted(
     predicted_T: Array,
     xi: Array,
@@ -295,8 +273,10 @@ def refitted(
     times: float,
     together: bool,
 ) -> tuple[Array, Array, tuple[Array, Array, Array], tuple[Array, Array, Array], Array]:
-    """A frame's fit under h hypotheses, by :func:`with_and_without`: its pose (4, 4), ``xi`` (m,) from the prediction,
-    where ``anchor_T`` (4, 4) is from there (6,), and what that function returns.
+    """A frame's fit under h hypotheses: its pose (4, 4), ``xi`` (m,) from the prediction, and where ``anchor_T`` (4, 4)
+    is from there (6,); then the fits' shifts, covariances and errors by the model by the kept edges alone, the same
+    with the anchor's pose, of a covariance ``known`` (6, 6) and errors by the model ``known_off`` (f or 1, 6), none of
+    these if they aren't asked for ``together``, and the normalised squares (h,) of the former's distances from it.
 
     ``pull`` to ``lasting``, of the edges ``edge`` (v,): as the fit has them; ``finger`` (e,) of each edge, of so many
     ``fingers``, and by how much one may be ``longer`` (3,), gripper frame, m: it pulls at a fit by all its edges
@@ -326,23 +306,27 @@ def refitted(
             for k in range(3):
                 model[0, v, i] += information[v, i, k] * tip[k]
     parts = fingers + len(finger)
-    of = with_and_without(
-        pull, information, middle, model, part, parts, keep, held, held_pull, at, known, known_off, times, together
-    )
-    return fit_T, at, of[0], of[1], of[2]
+    sums, normal, spread, of_model = add_up(
+        pull, information, middle, model, part, parts, keep, held, held_pull
+    )  # fmt: skip
+    alone = separate(sums, normal, spread, of_model, 6)
+    asked = len(sums) if together else 0
+    sums, normal, spread, of_model = with_pose(
+        sums[:asked], normal[:asked], spread[:asked], of_model[:asked], at, known, known_off
+    )  # fmt: skip
+    with_it = separate(sums, normal, spread, of_model, 6)
+    return fit_T, at, alone, with_it, squares(alone[0], at, alone[1], alone[2], times, known, known_off)
 
 
 @compiled
-def _blend(mean: Array, other: Array, share: Array, upper: Array, backward: bool, out: Array) -> None:
-    """``out`` (6,): mean + S U' (other - mean), S = ``share`` and U = ``upper``; the roles swapped if ``backward``."""
+def _blend(mean: Array, other: Array, gain: Array, backward: bool, out: Array) -> None:
+    """``out`` (6,): mean + K (other - mean), K = ``gain``; the roles swapped if ``backward``."""
+    first, last = (other, mean) if backward else (mean, other)
     for i in range(6):
-        out[i] = other[i] if backward else mean[i]
-    for k in range(6):
-        white = 0.0
-        for j in range(6):
-            white += upper[j, k] * (mean[j] - other[j] if backward else other[j] - mean[j])
-        for i in range(6):
-            out[i] += share[i, k] * white
+        total = first[i]
+        for k in range(6):
+            total += gain[i, k] * (last[k] - first[k])
+        out[i] = total
 
 
 @compiled
@@ -379,23 +363,28 @@ def join(
     rooted = _inverse(both, white, work[4], upper)
     for i in range(6):
         for j in range(6):
-            white[i, j] = 0.0
+            total = 0.0
             for k in range(6):
-                white[i, j] += smaller[i, k] * upper[k, j]
-    share, taken = white if rooted else smaller, 0.0
+                total += smaller[i, k] * upper[k, j]
+            white[i, j] = total
+    share, gain, taken = white if rooted else smaller, both, 0.0
     for i in range(6):
         for j in range(6):
-            taken += share[i, j] * upper[i, j]
+            total = 0.0
+            for k in range(6):
+                total += share[i, k] * upper[j, k]
+            gain[i, j] = total
+        taken += gain[i, i]
         for j in range(i + 1):
             total = 0.0
             for k in range(6):
                 total += share[i, k] * white[j, k]
             new_covariance[i, j] = new_covariance[j, i] = smaller[i, j] - total
-    _blend(mean, shift, share, upper, backward, new_mean)
+    _blend(mean, shift, gain, backward, new_mean)
     for f in range(len(new_off)):
         before_off = off[min(f, len(off) - 1)]
         if before_off.any() or of_model[f].any():
-            _blend(before_off, of_model[f], share, upper, backward, new_off[f])
+            _blend(before_off, of_model[f], gain, backward, new_off[f])
         else:
             for i in range(6):
                 new_off[f, i] = 0.0
@@ -414,6 +403,7 @@ def jumped(
     prior: Array,
     stays: Bools,
     times: float,
+    enough: Array,
 ) -> Array:
     """Probabilities (h, c) of the jumps that may have carried a pose away from where it is known to have been, given
     a frame's fits ``shift`` (h, 6) with their ``covariance`` R (h, 6, 6) and errors by the model, ``off`` (h, f, 6).
@@ -421,34 +411,43 @@ def jumped(
     ``at`` (6,) with its covariance ``known`` C (6, 6) and ``known_off`` (f or 1, 6): the pose before; ``jumps`` J
     (c, 6, 6), of the probability ``prior`` (h, c) each; ``stays`` (h,): whether it may as well have stayed.  By Bayes a
     jump's probability is its prior times the normal density of the fit with ``times`` R + C + J (and :func:`between`),
-    over the sum of these and of having stayed.
+    over the sum of these and of having stayed.  Where they are together no more than ``enough`` (h,) though the fit
+    were in the middle of the wider densities, which are nowhere higher than the middle of the narrowest: that.
     """
     count, kinds = prior.shape
-    root, white, apart, both = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    log_density, out = np.empty(kinds + 1), np.zeros((count, kinds))
+    root, white, way, log_density = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(kinds + 1)
+    apart, both, out = np.empty((6, 6)), np.empty((6, 6)), np.zeros((count, kinds))
     for h in range(count):
-        highest, stay = -math.inf, 1.0
+        ever = prior[h].sum()
+        if ever == 0.0:
+            continue
         between(covariance[h], off[h], known, known_off, times, apart)
-        for c in range(kinds + 1):
+        for i in range(6):
+            way[i] = shift[h, i] - at[i]
+        highest, stay, likelier, solved = -math.inf, max(1.0 - ever, 0.0), 0.0, True
+        for c in range(kinds, -1, -1):
             log_density[c] = -math.inf
-            if stays[h] if c == kinds else prior[h, c] > 0.0:
+            if solved and (stays[h] if c == kinds else prior[h, c] > 0.0):
                 for i in range(6):
                     for j in range(6):
                         both[i, j] = apart[i, j] + (jumps[c, i, j] if c < kinds else 0.0)
-                log_density[c] = -0.5 * square(both, shift[h] - at, root, white)
+                normalised, scale = square(both, way, root, white), 1.0
                 for i in range(6):
-                    log_density[c] += math.log(root[i, i])
+                    scale *= root[i, i]
+                log_density[c] = math.log(scale) - 0.5 * normalised
+                if c == kinds:
+                    likelier = math.exp(0.5 * normalised) / stay
+                    solved = ever * likelier > enough[h]
             highest = max(highest, log_density[c])
         total = 0.0
         for c in range(kinds):
-            stay -= prior[h, c]
-            if prior[h, c] > 0.0:
-                out[h, c] = prior[h, c] * math.exp(log_density[c] - highest)
-                total += out[h, c]
+            out[h, c] = prior[h, c] * (math.exp(log_density[c] - highest) if solved else likelier)
+            total += out[h, c]
         if stays[h]:
-            total += max(stay, 0.0) * math.exp(log_density[kinds] - highest)
-        if total > 0.0:
-            out[h] /= total
+            total += stay * math.exp(log_density[kinds] - highest)
+        for c in range(kinds):
+            if solved and total > 0.0:
+                out[h, c] /= total
     return out
 
 
@@ -498,7 +497,8 @@ def knocked(
     share: Array,
     along: Bools,
     prior: Array,
-    probable: Array,
+    seen: float,
+    unseen: float,
     stays: Bools,
     endless: Bools,
     least: float,
@@ -508,15 +508,16 @@ def knocked(
     (r,), their probabilities (r,), and that of all others.
 
     ``share`` (c,): how probable each of the ``jumps`` (c, 6, 6) is once there is one, ``along`` (c,): those that an
-    ``endless`` (h,) fit doesn't show, so that nothing is held against them; ``prior`` (h,): of the fits; ``probable``
-    (h,): of a jump under each.  The others as for :func:`jumped`.
+    ``endless`` (h,) fit doesn't show, so that nothing is held against them: that no end of a finger is left; ``prior``
+    (h,): of the fits; ``unseen``: of a jump under these, ``seen``: under the others.  The rest as for :func:`jumped`.
     """
     count, kinds = len(prior), len(share)
-    weight, total, before = np.zeros((count, kinds)), 0, np.zeros((count, kinds))
+    weight, total, before, enough = np.zeros((count, kinds)), 0, np.zeros((count, kinds)), np.zeros(count)
     for h in range(count):
+        enough[h] = least / prior[h]
         for c in range(kinds):
-            before[h, c] = probable[h] * share[c] if prior[h] > 0.0 else 0.0
-    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+            before[h, c] = (unseen if endless[h] else seen) * share[c] if prior[h] > 0.0 else 0.0
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times, enough)
     left_out = 0.0
     for h in range(count):
         for c in range(kinds):
@@ -596,5 +597,10 @@ def telling(
         own = of_frame[h, 0, 0] + of_frame[h, 1, 1] + of_frame[h, 2, 2]
         surer = own < spread[g, 0, 0] + spread[g, 1, 1] + spread[g, 2, 2]
         if surer or square(of_frame[h] + spread[g], shift[h] - away[g], root, white) > limit:
-            away[g], spread[g], error[g] = shift[h], of_frame[h], of_model[h]
+            for i in range(6):
+                away[g, i] = shift[h, i]
+                for k in range(6):
+                    spread[g, i, k] = of_frame[h, i, k]
+                for f in range(off.shape[1]):
+                    error[g, f, i] = of_model[h, f, i]
     return away, spread, error

@@ -69,12 +69,7 @@ class Knocks(NamedTuple):
     @classmethod
     def of(cls, axis_cam: Array) -> Knocks:
         """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        length, kinds = math.sqrt(float(axis_cam @ axis_cam)), len(ANY_SHARE)
-        if length == 0.0:
-            return cls(np.array(ANY_SHARE), _BY_KIND.covariance[:kinds], _BY_KIND.along[:kinds])
-        covariance, way = _BY_KIND.covariance.copy(), axis_cam / length
-        covariance[kinds:, :3, :3] = np.square(ALONG_SIGMA_M)[:, None, None] * (way[:, None] * way)
-        return _BY_KIND._replace(covariance=covariance)
+        return cls(*kinds_of(axis_cam))
 
     @property
     def spread(self) -> Array:
@@ -82,14 +77,27 @@ class Knocks(NamedTuple):
         return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
 
 
-_BY_KIND = Knocks(
-    np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)]),
-    np.stack(
-        [np.diag([sigma_m**2] * 3 + [TURN_SIGMA_RAD**2] * 3) for sigma_m in ANY_SIGMA_M]
-        + [np.zeros((6, 6))] * len(ALONG_SHARE)  # by the fingers' direction
-    ),
-    np.arange(len(ANY_SHARE) + len(ALONG_SHARE)) >= len(ANY_SHARE),
-)
+_SHARE = np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)])
+
+
+@compiled
+def kinds_of(axis_cam: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Those of :class:`Knocks`."""
+    square, anywhere = 0.0, len(ANY_SHARE)
+    for i in range(3):
+        square += axis_cam[i] * axis_cam[i]
+    count = len(_SHARE) if square > 0.0 else anywhere
+    share, covariance, along = np.empty(count), np.zeros((count, 6, 6)), np.zeros(count, np.bool_)
+    for c in range(count):
+        share[c], along[c] = _SHARE[c] if square > 0.0 else ANY_SHARE[c], c >= anywhere
+        for i in range(6):
+            if c < anywhere:
+                covariance[c, i, i] = ANY_SIGMA_M[c] ** 2 if i < 3 else TURN_SIGMA_RAD**2
+                continue
+            for k in range(3):
+                if i < 3:
+                    covariance[c, i, k] = ALONG_SIGMA_M[c - anywhere] ** 2 * axis_cam[i] * axis_cam[k] / square
+    return share, covariance, along
 
 
 @compiled

@@ -13,7 +13,6 @@ import math
 import numpy as np
 
 from gripmon.model.compiled import compiled
-from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Ints, join, square
 
@@ -56,26 +55,18 @@ def _enter(
     position and in rotation, and the tails of its error, sigma twice and factor twice, with its ``covariance`` (6, 6)
     and the errors by the model, ``off`` (f, 6) and ``alike`` (p, 6).
     """
-    block = np.empty((3, 3))
-    for part in range(2):
-        first, total = 3 * part, 0.0
-        for i in range(3):
-            total += shift[first + i] ** 2
-            for j in range(i + 1):
-                block[i, j] = inflation**2 * covariance[first + i, first + j]
+    more = inflation**2
+    for x in range(0, 6, 3):
+        y, z, part = x + 1, x + 2, x // 3
+        xx, yy, zz = more * covariance[x, x], more * covariance[y, y], more * covariance[z, z]
+        xy, xz, yz = more * covariance[y, x], more * covariance[z, x], more * covariance[z, y]
         for error in (off, alike):
             for f in range(len(error)):
-                a, b, c = error[f, first], error[f, first + 1], error[f, first + 2]
-                block[0, 0] += a * a
-                block[1, 0] += b * a
-                block[1, 1] += b * b
-                block[2, 0] += c * a
-                block[2, 1] += c * b
-                block[2, 2] += c * c
-        table[1 + part, number] = math.sqrt(total)
-        table[3 + part, number], table[5 + part, number] = _tail(
-            block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
-        )
+                a, b, c = error[f, x], error[f, y], error[f, z]
+                xx, yy, zz = xx + a * a, yy + b * b, zz + c * c
+                xy, xz, yz = xy + b * a, xz + c * a, yz + c * b
+        table[1 + part, number] = math.sqrt(shift[x] ** 2 + shift[y] ** 2 + shift[z] ** 2)
+        table[3 + part, number], table[5 + part, number] = _tail(xx, yy, zz, xy, xz, yz)
 
 
 @compiled
@@ -83,10 +74,7 @@ def doubted(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     alike: Array,
     farther: Array,
     inflation: float,
@@ -94,26 +82,17 @@ def doubted(
     table: Array,
     first: int,
 ) -> None:
-    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of the fits ``rows`` (r,), and, where it is
-    more than a ``share``, how far they are from the pose ``away`` (6,), position and rotation, each ``farther`` (2,),
-    and the tails of their errors: sigma twice and factor twice.
-
-    ``shift`` (h, 6), ``covariance`` (h, 6, 6), to which ``more`` (6, 6) is added, and errors by the model ``off``
-    (h, f, 6), with those that all have, ``alike`` (p, 6).
+    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of fits, and, where it is more than a
+    ``share``, how far they are away, ``shift`` (r, 6), position and rotation, each ``farther`` (2,), and the tails of
+    their errors, sigma twice and factor twice: by ``covariance`` (r, 6, 6) and errors by the model ``off`` (r, f, 6),
+    with those that all have, ``alike`` (p, 6).
     """
-    apart, spread = np.empty(6), np.empty((6, 6))
-    for r in range(len(rows)):
-        h, number = rows[r], first + r
-        table[0, number] = prior[r]
-        if prior[r] <= share:
-            continue
-        for i in range(6):
-            apart[i] = shift[h, i] - away[i]
-            for j in range(6):
-                spread[i, j] = covariance[h, i, j] + more[i, j]
-        _enter(apart, spread, off[h], alike, inflation, table, number)
-        for part in range(2):
-            table[1 + part, number] += farther[part]
+    for r in range(len(prior)):
+        table[0, first + r] = prior[r]
+        if prior[r] > share:
+            _enter(shift[r], covariance[r], off[r], alike, inflation, table, first + r)
+            for part in range(2):
+                table[1 + part, first + r] += farther[part]
 
 
 @compiled
@@ -219,78 +198,6 @@ def levels(
 
 
 @compiled
-def _seen_from(covariance: Array, jacobian: Array, half: Array, out: Array) -> None:
-    """``out`` += J C J', each (6, 6); ``half`` (6, 6) is overwritten."""
-    for i in range(6):
-        for j in range(6):
-            half[i, j] = 0.0
-            for k in range(6):
-                half[i, j] += jacobian[i, k] * covariance[k, j]
-    for i in range(6):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(6):
-                total += half[i, k] * jacobian[j, k]
-            out[i, j] += total
-            if j < i:
-                out[j, i] += total
-
-
-@compiled
-def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Of a pose x, ``cam_T_grip``, and the one ``first_T`` that it had at the reference, x_b: the Jacobians (6, 6)
-    ``lever`` from the difference of their errors to that of exp(d) reference, which is as far from x_b as the reference
-    is wrong, and ``turn`` of an error of x_b to camera axes as they are after d; the motion exp(d), exp(d) reference,
-    (4, 4) each, and the perturbation (6,) from there back to the reference.
-    """
-    lever, turn, motion, at_T = np.eye(6), np.zeros((6, 6)), np.zeros((4, 4)), np.zeros((4, 4))
-    arm = np.zeros(3)
-    motion[3, 3] = at_T[3, 3] = 1.0
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                motion[i, j] += cam_T_grip[i, k] * first_T[j, k]
-            turn[i, j] = turn[3 + i, 3 + j] = motion[i, j]
-        motion[i, 3] = at_T[i, 3] = cam_T_grip[i, 3]
-        for k in range(3):
-            motion[i, 3] -= motion[i, k] * first_T[k, 3]
-            arm[i] += motion[i, k] * (reference_T[k, 3] - first_T[k, 3])
-            for j in range(3):
-                at_T[i, j] += motion[i, k] * reference_T[k, j]
-        at_T[i, 3] += arm[i]
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        lever[a, 3 + b], lever[b, 3 + a] = arm[i], -arm[i]
-    return lever, turn, motion, at_T, perturbation_between(at_T, reference_T)
-
-
-@compiled
-def begun(
-    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
-) -> tuple[Array, Array, Array]:
-    """What g fits b at the reference, ``shift`` (g, 6), ``covariance`` C (g, 6, 6) and errors by the model ``off``
-    (g, f, 6), take from a motion since: L T of the shifts and of the errors, and the covariances L (T C T' + M) L',
-    with the Jacobians ``lever`` L and ``turn`` T and M = ``more`` (6, 6).
-    """
-    count, turned = len(shift), lever @ turn
-    half, besides = np.empty((6, 6)), np.zeros((6, 6))
-    shifts, covariances, offs = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros(off.shape)
-    _seen_from(more, lever, half, besides)
-    for g in range(count):
-        _seen_from(covariance[g], turned, half, covariances[g])
-        for i in range(6):
-            for k in range(6):
-                covariances[g, i, k] += besides[i, k]
-                shifts[g, i] += turned[i, k] * shift[g, k]
-        for f in range(off.shape[1]):
-            if off[g, f].any():  # most edges of a gripper are seen in no frame
-                for i in range(6):
-                    for k in range(6):
-                        offs[g, f, i] += turned[i, k] * off[g, f, k]
-    return shifts, covariances, offs
-
-
-@compiled
 def _by_motion(by_motion: Array, travel: Array, moved: Array, at: Array, shift: Array, out: Array) -> None:
     """``out`` (k² + k, 6): errors by a motion of which k directions make ``by_motion`` (k, 6, 3) each, of the second
     order and of the first, with that of the jaws' ``travel`` (6,).  Each by the motion that a fit has, ``shift`` (6,)
@@ -323,10 +230,11 @@ def _levered(covariance: Array, lever: Array, out: Array) -> None:
     half = np.empty((6, 6))
     for i in range(6):
         for j in range(6):
-            half[i, j] = covariance[i, j]
+            total = covariance[i, j]
             if i < 3:
                 for k in range(3, 6):
-                    half[i, j] += lever[i, k] * covariance[k, j]
+                    total += lever[i, k] * covariance[k, j]
+            half[i, j] = total
     for i in range(6):
         for j in range(i + 1):
             total = half[i, j]
@@ -396,10 +304,7 @@ def moved(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     which: Ints,
     from_shift: Array,
     from_covariance: Array,
@@ -432,37 +337,30 @@ def moved(
     """
     parts, kinds = off.shape[1], len(by_motion)
     errors = parts + kinds * kinds + kinds
-    apart, spread, half, none = np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.zeros((0, 6))
+    half, none = np.empty((6, 6)), np.zeros((0, 6))
     way, scatter, error = np.empty(6), np.empty((6, 6)), np.empty((errors, 6))
     joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((5, 6, 6))
     exact, true_way, unsure = np.zeros((errors, 6)), np.empty(6), np.empty((6, 6))
-    before = -1
-    for r in range(len(rows)):
-        h, g, number = rows[r], which[r], first + r
+    for r in range(len(prior)):
+        g, number = which[r], first + r
         table[0, number] = prior[r]
         if prior[r] <= share:
             continue
-        if h != before:
-            for i in range(6):
-                apart[i] = shift[h, i] - away[i]
-                for j in range(6):
-                    spread[i, j] = covariance[h, i, j] + more[i, j]
-            _levered(spread, lever, half)
-            before = h
+        _levered(covariance[r], lever, half)
         for i in range(6):
-            way[i] = -from_shift[g, i] + apart[i]
+            way[i] = -from_shift[g, i] + shift[r, i]
             for k in range(3, 6):
                 if i < 3:
-                    way[i] += lever[i, k] * apart[k]
+                    way[i] += lever[i, k] * shift[r, k]
             for j in range(6):
                 scatter[i, j] = half[i, j] + from_covariance[g, i, j]
         for f in range(parts):
             for i in range(6):
-                error[f, i] = -from_off[g, f, i] + off[h, f, i]
-            if off[h, f].any():
+                error[f, i] = -from_off[g, f, i] + off[r, f, i]
+            if off[r, f].any():
                 for i in range(3):
                     for k in range(3, 6):
-                        error[f, i] += lever[i, k] * off[h, f, k]
+                        error[f, i] += lever[i, k] * off[r, f, k]
         of_motion = way
         if len(usual):
             knocked = _stayed(way, scatter, error[:parts], stays_at, usual, knock, odds, true_way, unsure, work)

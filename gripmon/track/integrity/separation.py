@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from gripmon.model.records import Array
-from gripmon.track.integrity import kernel, level_kernel
+from gripmon.track.integrity import frame_kernel, kernel, level_kernel
 from gripmon.track.integrity.knocks import Knocks, least_known
 
 LEVEL_TOLERANCE_RATIO = 1.02
@@ -114,72 +114,6 @@ def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
     return Separation(*kernel.with_known(*fits, at, covariance))
 
 
-def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """See :func:`level_kernel.motion_since`."""
-    return level_kernel.motion_since(cam_T_grip, first_T, reference_T)
-
-
-def begun(first: Separation, lever: Array, turn: Array, more: Array) -> Separation:
-    """What the fits ``first`` at the reference take from a motion since, see :func:`level_kernel.begun`."""
-    return Separation(*level_kernel.begun(*first, lever, turn, more))
-
-
-def telling(
-    averages: Separation, at: Array, wander: Array, frame: Separation, rows: NDArray[np.intp], limit: float
-) -> Separation:
-    """Under each hypothesis what knows more by the position's variances, the average, from ``at`` (6,) and after a way
-    with the variances ``wander`` (6,), or the frame's fit ``rows`` (g,); but the frame's where they differ by more than
-    a normalised square of ``limit``.  A negative row is no fit.
-    """
-    return Separation(*kernel.telling(*averages, at, wander, *frame, rows, limit))
-
-
-class Knocked(NamedTuple):
-    """That a pose was knocked, under r of h hypotheses: which ``fit`` (r,) and which ``jump`` (r,), the ``prior`` (r,)
-    of both together, and ``left_out``, that of all others.
-    """
-
-    fit: NDArray[np.intp]
-    jump: NDArray[np.intp]
-    prior: Array
-    left_out: float
-
-
-def knocked(
-    frame: Separation,
-    known: tuple[Array, Array, Array],
-    knocks: Knocks,
-    prior: Array,
-    probable: Array,
-    stays: NDArray[np.bool_],
-    endless: NDArray[np.bool_],
-    least: float,
-    times: float,
-) -> Knocked:
-    """Under which hypotheses the pose, ``known`` to have been somewhere (6,) but for a covariance (6, 6) and errors by
-    the model (f or 1, 6), was knocked, given the frame's fits.  What is less probable than ``least`` is left out.
-
-    ``prior`` (h,): of the hypotheses; ``probable`` (h,): of a knock under each; ``stays`` (h,): whether it may as well
-    have stayed; ``endless`` (h,): whether no end of a finger is left, which alone show a knock along the fingers: that
-    it is exactly along them isn't held against it then.  ``times``: factor on the fits' covariances for their tails.
-    """
-    of = knocks.covariance, knocks.share, knocks.along
-    return Knocked(*kernel.knocked(*frame, *known, *of, prior, probable, stays, endless, least, times))
-
-
-def after_knocks(
-    frame: Separation, known: tuple[Array, Array, Array], knocks: Knocks, of: Knocked, share: float
-) -> Separation:
-    """Where the pose is after the knocks ``of`` :func:`knocked` that are more probable than a ``share``; zeros for the
-    others.
-    """
-    shift, covariance, of_model = frame
-    jumps = knocks.covariance
-    return Separation(
-        *kernel.after_jumps(shift, covariance, of_model, *known, jumps, of.fit, of.jump, of.prior, share)
-    )
-
-
 class Tails(NamedTuple):
     """How probably normal vectors are longer than something: ``sigma`` (...,) along the longest axis of each, and the
     power of ten ``factor`` (...,) by which the two others raise the tail of that one.
@@ -218,32 +152,25 @@ def bounds(covariance: Array, risk: Array) -> Array:
 
 class Cases(NamedTuple):
     """Things that may be wrong with a published pose, r of them: the ``name`` that each is ``called`` (r,) by, its
-    ``prior`` (r,), and which ``rows`` (r,) of the ``fits`` is the one under it.  The fits count from a pose that the
-    published one is ``away`` (6,) from, and the covariance ``more`` (6, 6) comes on top.  ``alike`` (p, 6): errors by
-    the model that all have, by their standard deviations; ``farther`` (2,): what is added to their distances, m and
-    rad.
+    ``prior`` (r,), and the ``fits`` under them as shifts from that pose.  ``alike`` (p, 6): errors by the model that
+    all have, by their standard deviations; ``farther`` (2,): what is added to their distances, m and rad.
     """
 
     prior: Array
     name: tuple[str, ...]
     called: NDArray[np.intp]
-    rows: NDArray[np.intp]
     fits: Separation
-    away: Array
-    more: Array = np.zeros((6, 6))
     alike: Array = np.zeros((0, 6))
     farther: Array = np.zeros(2)
 
     @classmethod
     def of(cls, name: tuple[str, ...], prior: Array, fits: Separation) -> Cases:
-        """``fits`` with shifts (h, 6) from the published pose."""
-        every = np.arange(len(prior))
-        return cls(prior, name, every, every, fits, np.zeros(6))
+        """Each by its own name."""
+        return cls(prior, name, np.arange(len(prior)), fits)
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.doubted`."""
-        of = *self.fits, self.rows, self.prior, self.away, self.more, self.alike, self.farther
-        level_kernel.doubted(*of, inflation, share, table, first)
+        level_kernel.doubted(*self.fits, self.prior, self.alike, self.farther, inflation, share, table, first)
 
 
 class Moved(NamedTuple):
@@ -271,11 +198,9 @@ class Moved(NamedTuple):
 
     def fill(self, table: Array, first: int, share: float, inflation: float) -> None:
         """Into a table, see :func:`level_kernel.moved`."""
-        prior, _, _, rows, fits, away, more, *_ = self.cases
+        of = *self.cases.fits, self.cases.prior, self.which, *self.begun
         since = self.lever, self.by_motion, self.travel, self.origin, self.tcp, self.stays_at, self.staying
-        true = self.usual, self.knock, self.odds
-        of = *fits, rows, prior, away, more, self.which, *self.begun, *since
-        level_kernel.moved(*of, *true, inflation, share, table, first)
+        level_kernel.moved(*of, *since, self.usual, self.knock, self.odds, inflation, share, table, first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,14 +249,21 @@ def warm_up() -> None:
         normal, known = (row, each, each, row, edge), (here, np.eye(6), np.zeros((1, 6)))
         made = (here, np.zeros(m)), normal, (edge, 1, np.zeros(3)), (whole, yes, np.ones(m)), (0.0, 1.0), known
         _, at, fits, _, _ = refitted(*made, 1.0)
-    averages, _ = follow(fits, fits, none)
-    before = at, np.eye(6), fits.of_model[0]
-    knocks = Knocks.of(least_known(np.eye(6), np.ones(3), 0.0))
-    found = knocked(fits, before, knocks, some, some, yes, yes, 1e-9, 1.0)
-    after_knocks(fits, before, knocks, found, 0.0)
-    told = with_known(telling(averages, none, none, fits, edge, 1.0), none, np.eye(6))
-    motion = begun(fits, *motion_since(here, here, here)[:2], np.eye(6))
+    follow(fits, fits, none)
+    Knocks.of(least_known(np.eye(6), np.ones(3), 0.0))
+    told = with_known(fits, none, np.eye(6))
+    motion = frame_kernel.begun(here, here, here, *fits, np.eye(6))[0]
+    frame_kernel.motion_since(here, here, here)
     cases = Cases.of(("", ""), np.ones(2), told)
     of = np.eye(6), np.zeros((0, 6, 3)), none, none[:3], none[:3], none, np.eye(6)
-    since = Moved(cases.prior, cases, edge, motion, *of)
+    since = Moved(cases.prior, cases, edge, Separation(*motion), *of)
     Doubts((cases, since), 1.0).levels(1e-5)
+    doubts, alike, limits = (some, yes, yes), np.zeros((0, 6)), (1e-5, 1.0, LEVEL_TOLERANCE_RATIO, *QUANTILES)
+    frame = here, tuple(fits), tuple(fits), fits.covariance, np.eye(6)
+    bare, knocks, before = (tuple(fits), doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), fits.of_model[0])
+    lasting, since_first = (tuple(fits), here, here, np.eye(6), none, edge, some), (motion, *of[:-1])
+    every = frame_kernel.gathered(
+        here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
+    )  # fmt: skip
+    frame_kernel.absolute_level(every[0], 2, alike, np.zeros(2), limits)
+    frame_kernel.level_of_motion(*every[:3], since_first, (np.eye(6), False, 0.0, 0.1), limits)

@@ -132,6 +132,7 @@ class FingerStrips:
         self._laid_out: tuple[Array, float | None] | None = None  # by which pose and opening
         self._layout: _Layout | None = None
         self._places: dict[int, _Places] = {}  # by how far the strips go on
+        self._beyond = 0  # how far the last comparison had to look
         self.ready = False
         """Whether it may judge: not by fingers of one shade."""
         self._usual = np.zeros(2 * REACH_PX + 1)  # correlations at each slide while the gripper stands in its place
@@ -160,7 +161,8 @@ class FingerStrips:
         self.frames += 1
         self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
         self._prepare(self._layout)
-        usual = self._alike(self._layout, image, cam_T_grip, jaw_opening_m)
+        farther = self._read(self._layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
+        usual = self._alike(self._layout, farther)
         self._usual += (usual - self._usual) / min(self.frames, MOST_FRAMES)
         self._know_farther()
 
@@ -202,11 +204,16 @@ class FingerStrips:
         farthest = self._farthest
         alone = beyond_chance * (1.0 - EXPLAINED_CORRELATION**2) <= 1.0 - farthest**2
         most_alike = EXPLAINED_CORRELATION if alone else 1.0  # one rib more or less is little
-        if alone:
-            strips = self._read(layout, image, cam_T_grip, jaw_opening_m)
-            if self._alike_here(layout, strips) >= most_alike:
-                return StripsSeen(here=True)  # usually: no slide could be better
-        unexplained = _unexplained(self._alike(layout, image, cam_T_grip, jaw_opening_m), most_alike)
+        # Read farther at once where that was needed the last time: mostly it is again.
+        beyond = self._beyond if alone else REACH_PX
+        strips = self._read(layout, image, cam_T_grip, jaw_opening_m, beyond)
+        explained = alone and self._alike_here(layout, strips[:, beyond : beyond + LENGTH_PX]) >= most_alike
+        self._beyond = 0 if explained else REACH_PX
+        if explained:
+            return StripsSeen(here=True)  # usually: no slide could be better
+        if beyond == 0:
+            strips = self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
+        unexplained = _unexplained(self._alike(layout, strips), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = float(unexplained.min())
@@ -230,9 +237,9 @@ class FingerStrips:
         there = np.clip(strips, -self._most, self._most) * layout.within
         return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
 
-    def _alike(self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> Array:
-        """(2 REACH_PX + 1,) correlations with what was learnt, slid along from a pose (4, 4)."""
-        strips = np.clip(self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX), -self._most, self._most)
+    def _alike(self, layout: _Layout, strips: NDArray[np.float32]) -> Array:
+        """(2 REACH_PX + 1,) correlations with what was learnt, of strips read so far beyond, slid along from there."""
+        strips = np.clip(strips, -self._most, self._most)
         energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
         product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
         # Where the strips leave the image nothing would differ; sums by Fourier transforms may be less than nothing.

@@ -1,12 +1,15 @@
-"""What ``track.integrity.kernel`` and ``level_kernel`` compile, function by function, by NumPy."""
+"""What ``track.integrity.kernel``, ``level_kernel`` and ``frame_kernel`` compile, by NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gripmon.model.geometry import invert, perturb, perturbation_between, skew
+from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
+from gripmon.track.integrity import Cases, Doubts, Knocks, Moved, Separation
 from gripmon.track.integrity.kernel import Ints
+from gripmon.track.integrity.knocks import least_known
 from gripmon.track.integrity.level_kernel import MOST_SIGMAS
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
@@ -55,28 +58,6 @@ def squared(off: Array) -> Array:
     return np.asarray(np.einsum("...fi,...fj->...ij", off, off))
 
 
-def with_and_without(
-    pull: Array,
-    information: Array,
-    middle: Array,
-    model: Array,
-    part: Ints,
-    parts: int,
-    keep: Array,
-    known: Array,
-    known_pull: Array,
-    at: Array,
-    covariance: Array,
-    off: Array,
-    times: float,
-    together: bool,
-) -> tuple[tuple[Array, ...], tuple[Array, ...], Array]:
-    sums = add_up(pull, information, middle, model, part, parts, keep, known, known_pull)
-    alone = separate(*sums, 6)
-    with_it = separate(*with_pose(*(each[: len(each) * together] for each in sums), at, covariance, off), 6)
-    return alone, with_it, squares(alone[0], at, alone[1], alone[2], times, covariance, off)
-
-
 def jumped(
     shift: Array,
     covariance: Array,
@@ -88,6 +69,7 @@ def jumped(
     prior: Array,
     stays: Array,
     times: float,
+    enough: Array,
 ) -> Array:
     every = np.concatenate([jumps, np.zeros((1, 6, 6))])
     share = np.column_stack([prior, np.where(stays, 1.0 - prior.sum(axis=1), 0.0)])
@@ -98,7 +80,10 @@ def jumped(
     square = (away * np.linalg.solve(both, np.broadcast_to(away, (*both.shape[:3], 1)))).sum(axis=(2, 3))
     log_density = -0.5 * (square + np.linalg.slogdet(both)[1])
     weight = share * np.exp(log_density - np.max(log_density, axis=1, keepdims=True))
-    return np.asarray((weight / weight.sum(axis=1, keepdims=True))[:, :-1])
+    with np.errstate(divide="ignore", over="ignore"):
+        most = prior * (np.exp(0.5 * square[:, -1]) / (1.0 - prior.sum(axis=1)))[:, None]
+    bounded = stays & (most.sum(axis=1) <= enough)
+    return np.where(bounded[:, None], most, (weight / weight.sum(axis=1, keepdims=True))[:, :-1])
 
 
 def joined(
@@ -145,14 +130,16 @@ def knocked(
     share: Array,
     along: Array,
     prior: Array,
-    probable: Array,
+    seen: float,
+    unseen: float,
     stays: Array,
     endless: Array,
     least: float,
     times: float,
 ) -> tuple[Ints, Ints, Array, float]:
-    before = np.outer(probable, share)
-    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times)
+    before = np.outer(np.where(endless, unseen, seen), share)
+    enough = least / np.maximum(prior, 1e-300)
+    given = jumped(shift, covariance, off, at, known, known_off, jumps, before, stays, times, enough)
     weight = prior[:, None] * np.where(np.outer(endless, along), np.maximum(given, before), given)
     counts = weight > least
     fit, jump = np.nonzero(counts)
@@ -214,10 +201,7 @@ def doubted(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     alike: Array,
     farther: Array,
     inflation: float,
@@ -225,8 +209,8 @@ def doubted(
     table: Array,
     first: int,
 ) -> None:
-    every = np.broadcast_to(alike, (len(rows), *alike.shape))
-    fits = shift[rows] - away, covariance[rows] + more, np.concatenate([off[rows], every], axis=1)
+    every = np.broadcast_to(alike, (len(prior), *alike.shape))
+    fits = shift, covariance, np.concatenate([off, every], axis=1)
     enter(table, first, prior, share, tails(*fits, inflation), farther)
 
 
@@ -247,10 +231,12 @@ def motion_since(cam_T_grip: Array, first_T: Array, reference_T: Array) -> tuple
 
 
 def begun(
-    shift: Array, covariance: Array, off: Array, lever: Array, turn: Array, more: Array
-) -> tuple[Array, Array, Array]:
+    cam_T_grip: Array, first_T: Array, reference_T: Array, shift: Array, covariance: Array, off: Array, more: Array
+) -> tuple[tuple[Array, Array, Array], Array, Array, Array, Array]:
+    lever, turn, motion, at_T, unmoved = motion_since(cam_T_grip, first_T, reference_T)
     turned = lever @ turn
-    return shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
+    fits = shift @ turned.T, lever @ (turn @ covariance @ turn.T + more) @ lever.T, off @ turned.T
+    return fits, lever, motion[:3, 3], at_T[:3, 3], unmoved
 
 
 def multivariate_density(way: Array, covariance: Array) -> Array:
@@ -263,10 +249,7 @@ def moved(
     shift: Array,
     covariance: Array,
     off: Array,
-    rows: Ints,
     prior: Array,
-    away: Array,
-    more: Array,
     which: Ints,
     from_shift: Array,
     from_covariance: Array,
@@ -286,9 +269,9 @@ def moved(
     table: Array,
     first: int,
 ) -> None:
-    way = (shift[rows] - away) @ lever.T - from_shift[which]
-    spread = lever @ (covariance[rows] + more) @ lever.T + from_covariance[which]
-    errors = [off[rows] @ lever.T - from_off[which]]
+    way = shift @ lever.T - from_shift[which]
+    spread = lever @ covariance @ lever.T + from_covariance[which]
+    errors = [off @ lever.T - from_off[which]]
     true_way = way
     if len(usual):
         whole = spread + np.einsum("rfi,rfj->rij", errors[0], errors[0])
@@ -347,7 +330,10 @@ def refitted(
     model = np.stack([information[:, :, :3] @ (fit_T[:3, :3] @ longer), lasting])
     part, at = np.stack([finger[edge], fingers + edge]), perturbation_between(fit_T, anchor_T)
     of = pull, information, middle, model, part, fingers + len(finger), keep, held, held_pull
-    return fit_T, at, *with_and_without(*of, at, known, known_off, times, together)
+    sums = add_up(*of)
+    alone = separate(*sums, 6)
+    with_it = separate(*with_pose(*(each[: len(each) * together] for each in sums), at, known, known_off), 6)
+    return fit_T, at, alone, with_it, squares(alone[0], at, alone[1], alone[2], times, known, known_off)
 
 
 def telling(
@@ -374,3 +360,85 @@ def telling(
         np.where(each, of_frame, covariance),
         np.where(each, of_model, off),
     )
+
+
+def gathered(
+    cam_T_grip: Array, displaced: bool, frame: tuple, doubts: tuple, solved: Array, bare: tuple, known: tuple,
+    of_knocks: tuple, lasting: tuple, first_prior: Array, _risk: float, least: float, times: float,
+) -> tuple[tuple, tuple[int, int, int], Array, float]:  # fmt: skip
+    fit_T, alone, anchored, covariance, floor = frame
+    axis, ends, cosine, *odds = of_knocks
+    average, from_T, origin_T, origin, wander, rows, lasting_prior = lasting
+    away, knocks = perturbation_between(fit_T, cam_T_grip), Knocks.of(least_known(covariance[ends], axis, cosine))
+    h, b, g, many, nowhere, left_out = len(solved), len(bare[1][0]), len(rows), len(first_prior), np.zeros(6), 0.0
+    here = np.flatnonzero(doubts[1])
+    # The fits, which of them, the pose that they count from, what their covariances lack, priors, names.
+    sets, counts = [(anchored, here, away, floor, doubts[0][here], here)], [len(here)]
+    for fits, (prior, stays, endless), base in ((alone, (solved, *doubts[1:]), 0), (*bare, h)):
+        if len(prior):
+            kinds = knocks.covariance, knocks.share, knocks.along
+            fit, jump, weight, out = knocked(*fits, *known, *kinds, prior, *odds, stays, endless, least, times)
+            after = after_jumps(*fits, *known, knocks.covariance, fit, jump, weight, 0.0)
+            sets.append((after, np.arange(len(fit)), away, floor, weight, base + fit))
+            left_out += out
+    counts.append(sum(len(each[1]) for each in sets))
+    every, nothing = np.arange(g), np.zeros((6, 6))
+    if g:
+        way = wander / times
+        at, own = perturbation_between(from_T, cam_T_grip), (alone[0] - away, covariance, alone[2])
+        told = telling(*average, at, way, *own, rows, CONTRADICTION_SQUARE)
+        with_origin = with_known(*told, perturbation_between(cam_T_grip, origin_T), origin + np.diag(way))
+        sets += [(each, every, nowhere, nothing, lasting_prior, h + b + every) for each in (with_origin, told)]
+    counts.append(counts[1] + g)
+    numbers = np.arange(1, many)
+    fits = alone if displaced else anchored
+    sets.append((fits, 0 * numbers, away, floor, first_prior[1:], h + b + many + numbers - 1))
+    cases = [
+        np.concatenate(each)
+        for each in zip(
+            *(
+                (fits[0][rows] - away, fits[1][rows] + more, fits[2][rows], prior, called)
+                for fits, rows, away, more, prior, called in sets
+            ),
+            strict=True,
+        )
+    ]
+    which = np.concatenate([np.zeros(counts[2], np.intp), every, numbers])
+    return (*cases, which), tuple(counts), knocks.spread, left_out
+
+
+def absolute_level(cases: tuple, count: int, alike: Array, farther: Array, limits: tuple) -> tuple[float, float, int]:
+    shift, covariance, off, prior, called, _ = cases
+    fits = Separation(shift[:count], covariance[:count], off[:count])
+    of = Cases.of(tuple(map(str, called)), prior[:count], fits)
+    return bound((of._replace(alike=alike, farther=farther),), limits)
+
+
+def bound(sets: tuple, limits: tuple) -> tuple[float, float, int]:
+    """Of sets whose names are numbers."""
+    *both, name = Doubts(sets, limits[1]).levels(limits[0])
+    return *both, int(name or -1)
+
+
+def level_of_motion(
+    cases: tuple, counts: tuple, spread: Array, first: tuple, mount: tuple, limits: tuple
+) -> tuple[float, float, int]:
+    """Set by set."""
+    shift, covariance, off, prior, called, which = cases
+    (usual, moves, unwatched, unnoticed), (here, now, ever) = mount, counts
+    name, since, none = tuple(map(str, called)), (Separation(*first[0]), *first[1:]), np.zeros((0, 6))
+
+    def of_motion(rows: range, times: float, staying: Array, **true: object) -> Moved:
+        some = np.array(rows, np.intp)
+        of = Cases(prior[some] * times, name, some, Separation(shift[some], covariance[some], off[some]))
+        return Moved(of.prior, of, which[some], *since, staying, **true)
+
+    by_truth, lasts = len(first[2]) > 1 and not moves, range(ever, len(prior))
+    true = {"usual": usual} if by_truth else {}
+    sets = [of_motion(range(here), 1.0, none, **true), of_motion(range(here, now), 1.0, none)]
+    if unwatched:
+        sets.append(of_motion(lasts, unwatched * (which[ever:] > 0), usual + spread))
+    if by_truth:
+        sets.append(of_motion(range(here), 1.0, none, usual=usual, knock=spread, odds=unnoticed))
+    sets.append(of_motion(lasts, 1.0, usual + spread if moves else usual, **true))
+    return bound(tuple(sets), limits)
