@@ -19,7 +19,7 @@ from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
 from gripmon.analyse.page import _sentences, page
 from gripmon.analyse.pictures import cut_alike
-from gripmon.analyse.plots import Figure
+from gripmon.analyse.plots import LONGEST_NAME, Figure, overview_figure
 from gripmon.analyse.summary import paragraph
 from gripmon.analyse.words import duration
 from gripmon.model.records import (
@@ -352,6 +352,17 @@ def test_several_robots_stand_on_one_axis_and_by_themselves():
     shown = page(report, told)
     assert b'id="data-overview"' in shown and b'id="recording-2"' in shown
     assert "The camera of other / wrist did not move" in text_of(shown)
+
+
+def test_long_names_leave_the_plot_its_room_and_stay_apart():
+    """Beside the plot of all recordings they took the whole width of a telephone."""
+    names = ["production_line_three_west_wing_cell_0012_left", "production_line_three_east_wing_cell_0012_left"]
+    report, _ = build([stepped(robot=name) for name in names])
+    drawn = json.loads(overview_figure(report.recordings).json())
+    strips = [trace["y"][0] for trace in drawn["data"] if trace["yaxis"] == "y2"]
+    axis = drawn["layout"]["yaxis2"]
+    assert sorted(set(strips)) == sorted(f"{name} / wrist" for name in names) == sorted(axis["tickvals"])
+    assert {len(text) for text in axis["ticktext"]} == {LONGEST_NAME} and axis["ticktext"][0].endswith("left / wrist")
 
 
 def test_empty_runs_and_runs_without_a_measurement_are_told():
