@@ -184,7 +184,8 @@ def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations():
     assert recording.at_end.size_m == pytest.approx(3e-3, abs=1e-5)
     assert recording.at_end_against_reference.size_m < 2e-5
     assert "accepted by the operator" in recording.summary and "which holds" in recording.summary
-    assert "gripmon watch --mount" in recording.summary and "gripmon send recalibrate" not in recording.summary
+    assert "gripmon watch --mount" in recording.summary and ", or use the new reference;" in recording.summary
+    assert "gripmon send recalibrate" not in recording.summary
 
 
 def test_the_error_of_a_configured_calibration_is_no_motion():

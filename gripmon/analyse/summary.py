@@ -202,8 +202,8 @@ def _what_to_do(report: RecordingReport) -> str:
     correct = f"correct what was recorded (gripmon correct {recorded} --out corrected.jsonl)"
     if not _off(report.at_end, report.limits):
         return f"What to do: {correct}."
-    stands = f"{back}, or {renew}" if _off(report.at_end_against_reference, report.limits) else back
-    return f"What to do: {stands}; {correct}."
+    held = not _off(report.at_end_against_reference, report.limits)
+    return f"What to do: {back}, or {'use the new reference' if held else renew}; {correct}."
 
 
 def _off(displacement: Displacement | None, limits: Limits) -> bool:
