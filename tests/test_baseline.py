@@ -76,3 +76,16 @@ def test_an_error_that_is_known_from_before_counts_from_the_first_frame():
     first = baseline.subtract(error + 1e-3)
     assert first is not None
     np.testing.assert_allclose(first, np.full(6, 1e-3))
+
+
+@pytest.mark.parametrize("at", [1, 2, 7])
+def test_a_knock_that_is_known_ends_the_first_frames(at: int):
+    """It was told only once there were as many frames as usual; those after it are no part of the error."""
+    baseline, first = Baseline(REFERENCE_SIGMA, 20), np.full(6, 1e-4)
+    baseline.knocked()
+    for _ in range(at):
+        assert baseline.subtract(first) is None
+    baseline.knocked()
+    later = baseline.subtract(first + 2e-3)
+    assert later is not None
+    np.testing.assert_allclose(later, np.full(6, 2e-3))

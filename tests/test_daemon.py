@@ -233,6 +233,20 @@ def test_faults_and_counts_of_those_around_the_loop_are_said_in_the_state():
     assert [(said.transforms_unsent, said.malformed) for said in bench.network.states[1:3]] == [(0, 0), (4, 3)]
 
 
+def test_the_log_says_another_reason_for_the_same_verdict_once(caplog: pytest.LogCaptureFixture):
+    """After a knock transforms stayed suspect, and the log named only the first reason, of one frame."""
+    reasons = ["not yet confirmed", "may be 2.1 mm off", "may be 2.2 mm off", "a side", "may be 1.9 mm off", "a side"]
+
+    def reasoned(seq: int) -> dict[str, object]:
+        return {"verdict": Verdict.SUSPECT, "reason": reasons[seq]} if seq < len(reasons) else {}
+
+    with caplog.at_level(logging.INFO, "gripmon"):
+        Bench(range(len(reasons) + 1), ScriptedMonitor(reasoned)).run()
+    said = [text.partition("transform ")[2] for text in caplog.messages if text.startswith("state tracking")]
+    told = [f"suspect ({reasons[number]})" for number in (0, 1, 3)]
+    assert said == [*told, "valid"], "figures change with every frame, and reasons come again"
+
+
 def test_a_report_that_fails_stops_nothing(caplog: pytest.LogCaptureFixture):
     def fails() -> int:
         raise RuntimeError("the session is\nclosed")

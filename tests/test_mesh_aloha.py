@@ -22,7 +22,7 @@ from gripmon.daemon.config import read_gripper
 from gripmon.model.camera import BrownConradyLens, Camera, make_camera
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
+from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.measure import teach
@@ -112,14 +112,16 @@ def test_narrow_taught_tips_are_valid_again_soon_after_a_knock():
     """One end of each finger is all that this view has: too few to prove a place elsewhere but for the strips."""
     camera, gripper, reference = rig()
     monitor = Monitor(camera, gripper, MonitorSettings(corners=SETTINGS), reference, taught(gripper, reference, camera))
-    before = -1
+    before, told = -1, set()
     for number in (*range(15, 20), *range(JUMP, JUMP + VALID_AGAIN + 1)):
         record = monitor.process(Frame(number, 10**18 + number * 33_333_333, image(number), OPENING_M))
         assert record.cam_T_grip is not None and record.protection is not None
         off_m = np.linalg.norm(np.array(record.cam_T_grip.translation_m) - truth(number)[:3, 3])
         assert off_m < record.protection.position_m
         before = number if record.verdict is Verdict.VALID and number < JUMP else before
+        told |= {alert.kind for alert in record.alerts}
     assert before == 19 and record.verdict is Verdict.VALID
+    assert told & {AlertKind.STEP, AlertKind.DRIFT}, "told within as few frames, though five came before the knock"
 
 
 @pytest.mark.parametrize("number", [JUMP - 1, JUMP])

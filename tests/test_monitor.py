@@ -175,6 +175,16 @@ def test_a_step_says_from_where_its_size_counts():
     assert " mm from where the first frames had it" in raised.text and "reference" not in raised.text
 
 
+def test_a_knock_soon_after_the_start_is_told_as_soon_as_a_later_one():
+    """It waited for the twenty frames that the reference's error is taken from; those before the knock have to do."""
+    frames, truths = frames_of("bump")
+    bumped = next(t.index for t in truths if "bumped" in t.events)
+    some = slice(bumped - 5, bumped + 10)
+    seen = watch(frames[some], truths[some], new_monitor(MonitorSettings()))
+    seq, kind = seen.alerts()[0]
+    assert kind in (AlertKind.STEP, AlertKind.DRIFT) and bumped + 1 <= seq <= bumped + 4
+
+
 @pytest.mark.parametrize("measurement", ["edges", "corners"])
 def test_a_bump_is_a_jump_then_a_recalibration_near_the_truth(measurement: str):
     seen = watched("bump", measurement)

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from support.policy_runs import (
     BENT,
+    BLACK,
     CLEARED,
     KNOCKED,
     PERHAPS_BENT,
+    PERIOD_S,
     RAISED,
     SETTINGS,
     UPDATED,
@@ -78,8 +80,21 @@ def test_a_creep_says_how_fast_and_how_long_until_the_limit():
 
 @pytest.mark.parametrize(("since_first", "where"), [(False, "the reference"), (True, "the first frames")])
 def test_a_motion_says_from_where_its_size_counts(since_first: bool, where: str):
-    [alert] = settled().feed(replace(seen(0.5), since_first=since_first)).alerts
-    assert alert.text.startswith(f"a step: TCP now +0.500 +0.000 +0.000 mm from where {where} had it (1 sigma")
+    run = settled()
+    [alert] = run.feed(replace(seen(0.5), since_first=since_first)).alerts
+    at = f"at {run.now_s:.1f} s of the images' clock the TCP was"
+    assert alert.text.startswith(f"a step: {at} +0.500 +0.000 +0.000 mm from where {where} had it (1 sigma")
+
+
+def test_what_is_read_later_says_of_which_time_it_is():
+    """An open alert is shown as it was raised for as long as nothing new is to be said."""
+    run = settled()
+    run.now_s += 1_700_000_000.0
+    [moved] = run.feed(seen(0.5)).alerts
+    assert "at 2023-11-14 22:15:" in moved.text and " UTC the TCP was" in moved.text
+    frames = round(SETTINGS.hold_s / PERIOD_S) + 2
+    told = [a.text for a in alerts_of(run.feed_all([BLACK] * frames)) if a.kind in (K.LOST, K.IMAGE)]
+    assert len(told) == 2 and all(" since 2023-11-14 22:15:" in text for text in told)
 
 
 def test_causes_and_the_part_are_in_the_alerts():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from support.policy_runs import (
     BENT,
     BEYOND,
     BLACK,
+    BOUNDED,
     CLEARED,
     HIDDEN,
     LOST,
@@ -72,13 +72,27 @@ def test_a_place_that_nothing_proves_any_more_is_told_after_as_long_as_a_transfo
     run, doubted = settled(), seen(protection=BEYOND, unproven=True)
     frames = round(SETTINGS.hold_s / PERIOD_S)
     assert kinds(run.feed_all([doubted] * frames)) == [], "an ordinary grasp hides the ends for a moment"
-    since = datetime.fromtimestamp(run.now_s - (frames - 1) * PERIOD_S, UTC)
+    since_s = run.now_s - (frames - 1) * PERIOD_S
     [alert] = run.feed(doubted).alerts
     assert (alert.kind, alert.event, alert.cause, alert.severity) == (K.OCCLUDED, RAISED, Cause.UNKNOWN, "warning")
-    assert f"not been seen where they should be since {since:%Y-%m-%d %H:%M:%S} UTC" in alert.text
+    assert f"not been seen where they should be since {since_s:.1f} s of the images' clock" in alert.text
     assert kinds(run.feed_all([doubted, HIDDEN] * 8)) == [], "it is the same"
     cleared = run.feed_all([seen()] * 4)
     assert kinds(cleared) == [(K.OCCLUDED, CLEARED)] and cleared[-1].state is TRACKING
+
+
+@pytest.mark.parametrize("protection", [BOUNDED, BEYOND], ids=["within the limit", "beyond it"])
+def test_a_gripper_that_stands_elsewhere_unproven_is_told_with_its_way(protection: Protection):
+    """Seconds of it went untold while the bound, which reaches to where it was, was within the limit now and then."""
+    run = settled()
+    away = [seen(2.5, present=False, believed=False, unproven=True, protection=p) for p in (protection, BOUNDED)]
+    frames = round(SETTINGS.hold_s / PERIOD_S)
+    told = alerts_of(run.feed_all([*away] * frames))
+    [alert] = told
+    assert (alert.kind, alert.event, alert.cause, alert.severity) == (K.OCCLUDED, RAISED, Cause.UNKNOWN, "warning")
+    assert alert.text.startswith("the gripper has been seen elsewhere since 100.5 s of the images' clock")
+    assert "at 101.5 s of the images' clock the TCP was +2.500 +0.000 +0.000 mm" in alert.text
+    assert kinds(run.feed_all([seen(where_it_was=True, believed=False)] * 4)) == [(K.OCCLUDED, CLEARED)]
 
 
 def test_hidden_fingers_that_show_without_their_ends_are_told_as_that():

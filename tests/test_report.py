@@ -19,7 +19,7 @@ from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
 from gripmon.analyse.page import _sentences, page
 from gripmon.analyse.pictures import cut_alike
-from gripmon.analyse.plots import Figure
+from gripmon.analyse.plots import LONGEST_NAME, Figure, overview_figure
 from gripmon.analyse.summary import paragraph
 from gripmon.analyse.words import duration
 from gripmon.model.records import (
@@ -65,6 +65,9 @@ def test_a_step_is_placed_at_its_frame_with_its_size_and_cause():
     assert (old.start_ns, old.end_ns) == (START_NS + 250 * PERIOD_NS, START_NS + 499 * PERIOD_NS)
     assert old.largest.size_m == pytest.approx(3e-3, abs=1e-5)
     assert "moved once" in recording.summary and "still displaced" in recording.summary
+    back, renew = "watch --mount --robot arm --camera wrist;", "gripmon send recalibrate --robot arm --camera wrist)"
+    assert back in recording.summary and renew in recording.summary and "howto/put_back.md" in recording.summary
+    assert recording.summary.endswith("(gripmon correct run-0001.rrd --out corrected.jsonl).")
 
 
 def test_a_step_and_its_return_end_the_affected_time():
@@ -80,6 +83,7 @@ def test_a_step_and_its_return_end_the_affected_time():
     # A median over nine frames follows within half of them.
     assert abs(old.end_ns - (START_NS + 400 * PERIOD_NS)) <= 5 * PERIOD_NS
     assert "It has moved back" in recording.summary
+    assert "What to do: correct what was recorded (gripmon correct run-0001.rrd" in recording.summary
 
 
 @pytest.mark.parametrize("kept", [slice(0, 256), slice(0, 400, 20)], ids=["cut short after it", "few frames"])
@@ -180,6 +184,8 @@ def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations():
     assert recording.at_end.size_m == pytest.approx(3e-3, abs=1e-5)
     assert recording.at_end_against_reference.size_m < 2e-5
     assert "accepted by the operator" in recording.summary and "which holds" in recording.summary
+    assert "gripmon watch --mount" in recording.summary and ", or use the new reference;" in recording.summary
+    assert "gripmon send recalibrate" not in recording.summary
 
 
 def test_the_error_of_a_configured_calibration_is_no_motion():
@@ -221,6 +227,7 @@ def test_a_displacement_that_another_background_would_look_like_may_be_one():
     told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3))
     assert "It may be displaced: when last measured" in told and "calibration may be affected" in told
     assert "by up to 7.1 mm another background would look the same" in told
+    assert "What to do" not in told
     turned = msgspec.structs.replace(recording.at_end, size_m=0.0, rotation_rad=0.09)
     told = paragraph(msgspec.structs.replace(recording, missable_m=7.1e-3, at_end=turned))
     assert "It is displaced" in told and "calibration is affected" in told
@@ -346,6 +353,17 @@ def test_several_robots_stand_on_one_axis_and_by_themselves():
     shown = page(report, told)
     assert b'id="data-overview"' in shown and b'id="recording-2"' in shown
     assert "The camera of other / wrist did not move" in text_of(shown)
+
+
+def test_long_names_leave_the_plot_its_room_and_stay_apart():
+    """Beside the plot of all recordings they took the whole width of a telephone."""
+    names = ["production_line_three_west_wing_cell_0012_left", "production_line_three_east_wing_cell_0012_left"]
+    report, _ = build([stepped(robot=name) for name in names])
+    drawn = json.loads(overview_figure(report.recordings).json())
+    strips = [trace["y"][0] for trace in drawn["data"] if trace["yaxis"] == "y2"]
+    axis = drawn["layout"]["yaxis2"]
+    assert sorted(set(strips)) == sorted(f"{name} / wrist" for name in names) == sorted(axis["tickvals"])
+    assert {len(text) for text in axis["ticktext"]} == {LONGEST_NAME} and axis["ticktext"][0].endswith("left / wrist")
 
 
 def test_empty_runs_and_runs_without_a_measurement_are_told():

@@ -75,7 +75,7 @@ def test_from_nothing_to_a_running_monitor(user: new_user.NewUser, walked: Walke
     assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()  # as the commands by hand give it (test_first_run.py)
     assert "OKsource" in seen["check"]["said"] and "FAIL" not in seen["check"]["said"]
     assert "transform" in seen["running"]["status"]
-    assert "a step: TCP now" in seen["run"]["log"] and "stopped after 90 frames" in seen["run"]["log"]
+    assert "a step: at " in seen["run"]["log"] and "stopped after 90 frames" in seen["run"]["log"]
     lines = [json.loads(line) for line in (folder / "run" / "estimates.jsonl").read_text().splitlines()]
     assert len(lines) == 90 and sum(line["verdict"] == "valid" for line in lines[: new_user.STEP]) > 0.9 * new_user.STEP
     commands = {step: each["command"] for step, each in seen.items()}
@@ -117,7 +117,7 @@ def test_the_same_with_rounded_tips_from_images(walked: Walked, driver: Any, tmp
     assert "the reference comes with it" in seen["gripper"]["said"]
     assert seen["gripper"]["command"].startswith("gripmon gripper from-images")
     assert "of 0 corners" not in seen["teach"]["status"] and "of the edges are inliers" in seen["teach"]["status"]
-    assert "FAIL" not in seen["check"]["said"] and "TCP now" in seen["run"]["log"]
+    assert "FAIL" not in seen["check"]["said"] and " the TCP was " in seen["run"]["log"]
     before, after = held_against(truth, folder)
     assert before > 0.5 and after > 0.0
 

@@ -315,6 +315,16 @@ def test_images_of_which_half_contradict_the_others_are_refused():
     assert re.match(r"left out: \d\.png: the gripper appears", refused.value.notes[0]) and len(str(refused.value)) < 300
 
 
+def test_images_of_which_half_have_another_jaw_opening_are_refused_as_that():
+    """It was "finger left isn't seen", or that the gripper isn't found in one of them."""
+    levels = (150.0, 180.0, 210.0)
+    images = [image_of(0.0, scene(dn, opening_m)) for opening_m in (OPENING_M, OPENING_M + 0.01) for dn in levels]
+    with pytest.raises(TeachingRefused, match=r"^3 of 6 images \(3\.png to 5\.png\) don't show the gripper") as refused:
+        taught_from(*images)
+    assert "the jaws or the camera stood elsewhere in them" in str(refused.value)
+    assert "each image with its own jaw opening (jaw_opening_m in timestamps.csv" in str(refused.value)
+
+
 def test_a_half_hidden_gripper_is_refused():
     image = image_of(0.0).copy()
     image[:, :430] = 128

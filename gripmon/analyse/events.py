@@ -24,7 +24,7 @@ TITLES = {
     AlertKind.RESTORED: "An earlier reference was brought back",
     AlertKind.RESTARTED: "The monitor restarted",
     AlertKind.LOST: "The gripper was out of sight",
-    AlertKind.OCCLUDED: "The view was blocked for a moment",
+    AlertKind.OCCLUDED: "The gripper was hidden, or nothing proved its place",
     AlertKind.IMAGE: "Bad images",
     AlertKind.STREAM: "The stream of frames was at fault",
     AlertKind.SOURCE: "The camera gave no frames",

@@ -32,6 +32,8 @@ _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 
 _YEARS = 1e5  # of at most four digits, and a sign
 _CLEAR, _GRID = "rgba(0,0,0,0)", "rgba(128,128,128,0.18)"
 _TOP_PX, _BOTTOM_PX, _STRIP_PX = 52, 44, 15
+LONGEST_NAME = 26
+"""Characters of 12 px type beside a plot: half of a telephone's 390 px."""
 _DRIFT = (
     (1, "tcp_from_reference_m", "from the reference in force", ORANGE),
     (1, "tcp_from_beginning_m", "from the calibration at the beginning", BLUE),
@@ -168,15 +170,21 @@ def overview_figure(reports: Sequence[RecordingReport]) -> Figure:
     strips = 26 * len(names) + 40
     figure = Figure(330 + strips, (("TCP off by (mm)", 280 / (280 + strips)), ("", strips / (280 + strips))))
     figure.axis(1, rangemode="tozero")
+    figure.axis(2, tickvals=[plain(name) for name in names], ticktext=[plain(_shortened(name)) for name in names])
     shown: set[str] = set()
     for report in reports:
         name = f"{report.robot} / {report.camera}"
         for curve in report.curves[:1]:
             colour = SERIES[names.index(name) % len(SERIES)]
-            figure.curve(1, curve, plain(name), colour, legend=name not in shown)
+            figure.curve(1, curve, plain(_shortened(name)), colour, legend=name not in shown)
             shown.add(name)
         figure.strip(2, plain(name), report.running.verdict_history)
     return figure
+
+
+def _shortened(name: str) -> str:
+    """With its middle left out if it would be wider than half of a telephone's screen."""
+    return name if len(name) <= LONGEST_NAME else f"{name[:10]}…{name[11 - LONGEST_NAME :]}"
 
 
 def running_figure(report: RecordingReport) -> Figure:

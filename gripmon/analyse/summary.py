@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 from gripmon.analyse.affected import excess
-from gripmon.analyse.content import AffectedRange, Event, RecordingReport, size
+from gripmon.analyse.content import AffectedRange, Displacement, Event, Limits, RecordingReport, size
 from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import SECOND_NS
 from gripmon.analyse.words import (
@@ -23,6 +25,7 @@ from gripmon.analyse.words import (
 )
 from gripmon.model.coverage import too_few
 from gripmon.model.records import AlertKind, Cause, CauseWeight
+from gripmon.record.recordings import UNKNOWN
 
 CAUSES: dict[str, str] = {
     Cause.CAMERA_MOUNT: "the camera's mount moved",
@@ -72,7 +75,7 @@ def paragraph(report: RecordingReport) -> str:
     motions = [event for event in report.events if event.kind in MOTIONS]
     maybe = not motions and _explained_by_backgrounds(report)
     parts = [missing(report), _motions(report, motions), _at_end(report, motions, maybe), _affected(report, maybe)]
-    parts.append(_lost(report))
+    parts += [_lost(report), "" if maybe else _what_to_do(report)]
     return " ".join(part for part in parts if part)
 
 
@@ -156,7 +159,7 @@ def _at_end(report: RecordingReport, motions: Sequence[Event], maybe: bool) -> s
         return ""
     last = "" if report.last_measured_ns is None else clock_time(report.last_measured_ns)
     measured = f"when last measured, at {last}"
-    if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
+    if not _off(off, report.limits):
         return f"It has moved back: {measured}, the TCP was {millimetres(off.size_m, off.sigma_m)} from where it began."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad, off.rotation_sigma_rad)}"
     verb = "may be" if maybe else "is still" if motions else "is"
@@ -168,7 +171,7 @@ def _at_end(report: RecordingReport, motions: Sequence[Event], maybe: bool) -> s
     if len(report.references) < 2 or now is None:
         return f"{text}, and there is no new reference."
     reference = report.references[-1]
-    held = excess(now.size_m, now.rotation_rad or 0.0, report.limits) < 1.0
+    held = not _off(now, report.limits)
     accepted = f"accepted by the {reference.accepted_by}, " if reference.accepted_by in _ACCEPTERS else ""
     by = f"reference {reference.reference_id} ({accepted}in force from {clock_time(reference.in_force_ns)})"
     return f"{text}; the monitor goes by {by}, which {'holds' if held else 'does not hold either'}."
@@ -184,6 +187,27 @@ def _affected(report: RecordingReport, maybe: bool) -> str:
     if stale:
         text += f"; work that relied on the reference then in force, {_times(stale)}"
     return text + "."
+
+
+def _what_to_do(report: RecordingReport) -> str:
+    """The commands that help where the calibration of the beginning didn't hold, or doesn't; else empty."""
+    if not any(a.what == "old_calibration" for a in report.affected):
+        return ""
+    robot = "ROBOT" if report.robot == UNKNOWN else shlex.quote(report.robot)
+    camera = "CAMERA" if report.camera == UNKNOWN else shlex.quote(report.camera)
+    files = [Path(file) for file in report.files] or [Path("RECORDING")]
+    recorded = shlex.quote(str(files[0] if len(files) == 1 else files[0].parent))
+    back = f"put the camera back (gripmon watch --mount --robot {robot} --camera {camera}; docs/howto/put_back.md)"
+    renew = f"measure a new reference where it is (gripmon send recalibrate --robot {robot} --camera {camera})"
+    correct = f"correct what was recorded (gripmon correct {recorded} --out corrected.jsonl)"
+    if not _off(report.at_end, report.limits):
+        return f"What to do: {correct}."
+    held = not _off(report.at_end_against_reference, report.limits)
+    return f"What to do: {back}, or {'use the new reference' if held else renew}; {correct}."
+
+
+def _off(displacement: Displacement | None, limits: Limits) -> bool:
+    return displacement is not None and excess(displacement.size_m, displacement.rotation_rad or 0.0, limits) >= 1.0
 
 
 def _times(ranges: Sequence[AffectedRange]) -> str:

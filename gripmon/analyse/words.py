@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
+from gripmon.model.units import FIRST_YEAR_NS
+
 COVERAGE = 2.0
 """Standard deviations of a frame's noise that count as significant, decide the digits and make the curves' bands."""
-_FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
 
 
 def clock_time(stamp_ns: int, digits: int = 1) -> str:
@@ -25,7 +26,7 @@ def date(stamp_ns: int) -> str:
 def period(start_ns: int, end_ns: int) -> str:
     """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is not a date."""
     times = f"{clock_time(start_ns, 0)} to {clock_time(end_ns, 0)}"
-    if 0 <= start_ns < _FIRST_YEAR_NS:
+    if 0 <= start_ns < FIRST_YEAR_NS:
         return f"{times} by a clock that began with the images, or with 1970"
     return f"{date(start_ns)}, {times} UTC"
 

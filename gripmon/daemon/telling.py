@@ -17,7 +17,7 @@ from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import Commands, JawFeed, Reports
 from gripmon.daemon.service import ServiceManager
 from gripmon.daemon.snapshots import OutlinesOf, no_outlines
-from gripmon.daemon.watch import DaemonSettings, Watch
+from gripmon.daemon.watch import DaemonSettings, Watch, kind_of
 from gripmon.io.publish.presence import in_words
 from gripmon.io.sources import Source
 from gripmon.model.errors import in_short
@@ -89,6 +89,7 @@ class Telling:
         self._start_s = self._next_state_s = time.monotonic()
         self._watch = Watch(self._settings, self._start_s)
         self._last_state: StateRecord | None = None
+        self._reasons_told: set[str] = set()  # by the log, since state and verdict changed last
         self._service = ServiceManager()
         self._faults: dict[str, str] = {}  # since the previous frame: what could not be delivered, and why
         self._logged_faults: dict[str, str] = {}  # in the log
@@ -171,6 +172,9 @@ class Telling:
         if waits and (last is None or last.proposal_id != self._proposal_id):
             _log.warning("%s (or reject)", waits)
         if last is None or (watch.state, verdict) != (last.state, last.verdict):
+            self._reasons_told.clear()
+        if (reason := kind_of(watch.message)) not in self._reasons_told:
+            self._reasons_told.add(reason)  # once: they may change with every frame
             because = f" ({message})" if message else ""
             line = f"state {watch.state}, transform {verdict}{because}"
             _log.info("%s", line)

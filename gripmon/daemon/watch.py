@@ -24,6 +24,7 @@ from gripmon.model.records import (
     ValidBy,
     Verdict,
 )
+from gripmon.model.units import in_time
 
 _RATE_OVER_FRAMES = 64
 _UPDATE_S = 10.0
@@ -159,7 +160,8 @@ class Watch:
             self.message = f"no frames: {reason}"
         if silence_s < self._settings.no_camera_alert_after_s:
             return []
-        silent = Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, f"no frame for {silence_s:.1f} s: {reason}")
+        since = in_time(stamp_ns - round(1e9 * silence_s))
+        silent = Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, f"no frame since {since}: {reason}")
         return list(self._alerts.present(_SILENCE, silent, now_s, stamp_ns))
 
     def end_of_frame(self, failure: str, undelivered: str, now_s: float, stamp_ns: int) -> list[Alert]:
@@ -191,7 +193,7 @@ class Watch:
     def _fails(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> list[Alert]:
         """Alerts about a failure, also when it now has another reason."""
         before = self._alerts.about(topic)
-        news = before is not None and _kind(before.text) != _kind(alert.text)
+        news = before is not None and kind_of(before.text) != kind_of(alert.text)
         return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
 
     def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
@@ -241,7 +243,7 @@ class Watch:
 
     def _keep_message(self, text: str) -> None:
         """Update the message only if it changes in more than its figures, which may differ in every frame."""
-        if _kind(text) != _kind(self.message):
+        if kind_of(text) != kind_of(self.message):
             self.message = text
 
     def _end_of_silence(self, now_s: float) -> list[Alert]:
@@ -251,7 +253,7 @@ class Watch:
         return list(self._alerts.absent(_SILENCE, text, now_s))
 
 
-def _kind(message: str) -> str:
+def kind_of(message: str) -> str:
     """The message without figures, which differ in every frame, and without what follows a second colon."""
     return FIGURES.sub("", ":".join(message.split(":")[:2]))
 

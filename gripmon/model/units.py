@@ -1,8 +1,19 @@
-"""Lengths and angles for people, with two significant digits (0.61, 1.2, 340); jaw openings as people type them."""
+"""Lengths and angles for people, with two significant digits (0.61, 1.2, 340); times; jaw openings as typed."""
 
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
+
+FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
+"""Images without time stamps count from 0: below this a stamp is not a date."""
+
+
+def in_time(stamp_ns: int) -> str:
+    """``2026-11-21 12:34:56 UTC``, truncated; ``5.0 s of the images' clock`` where that counts from 0."""
+    if 0 <= stamp_ns < FIRST_YEAR_NS:
+        return f"{stamp_ns // 100_000_000 / 10:.1f} s of the images' clock"
+    return f"{datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def in_mm(length_m: float) -> str:

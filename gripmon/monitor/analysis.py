@@ -267,6 +267,8 @@ class FrameAnalysis:
         shares = agreeing_fingers(measurement, self._gripper)
         astray = gripper_astray(measurement, shares)
         self._astray = self._astray + 1 if astray else 0
+        if standing.knocked:
+            self.baseline.knocked()
         # A few doubtful frames say nothing; many are a lasting change.
         if 0 < self._astray < DOUBTED_FRAMES or not standing.believed:
             motion = self.watch.skip()

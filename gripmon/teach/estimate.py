@@ -272,17 +272,28 @@ LOST_SHARE = 0.25
 """Part below which the gripper, or a finger, counts as absent."""
 
 
+def is_absent(viewer: Viewer, view: View, lines: Mapping[int, EdgeLines]) -> bool:
+    """Whether an image shows nothing of the gripper where it should be; ``lines``: of this image alone."""
+    profiles, seen = _outlines(viewer, [view], lines)
+    return bool(seen.sum() < LOST_SHARE * profiles.sum())
+
+
+def _outlines(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> tuple[Array, Array]:
+    """(e,) search lines of the straight outlines in view, long enough for one, and of those that are seen; else 0."""
+    profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
+    profiles = np.where(viewer.bent | (profiles < FEWEST_POINTS * len(views)), 0, profiles)
+    return profiles, profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
+
+
 def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
     """Refuse if too little of the gripper, or of one finger, is seen: of what can be seen as lines, outlines, straight
     or nearly so, that are long enough for one.
     """
-    profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
-    profiles = np.where(viewer.bent | (profiles < FEWEST_POINTS * len(views)), 0, profiles)
+    profiles, seen = _outlines(viewer, views, lines)
     if not profiles.any():
         raise TeachingRefused(
             "no outline in view is nearly straight, and only such edges are taught; the gripper file without teaching"
         )
-    seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
     share = seen.sum() / max(profiles.sum(), 1)
     if share < TAUGHT_SHARE:
         found = "the gripper isn't found: " if share < LOST_SHARE else ""

@@ -31,6 +31,7 @@ from gripmon.teach.estimate import (
     check_reference,
     estimate_edges,
     found_off,
+    is_absent,
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
 from gripmon.teach.play import with_play
@@ -93,8 +94,9 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
     others is left out as long as most of them remain.
     """
     assert images, "nothing to teach from"
-    viewer = Viewer(rig, reference, images)
+    viewer = everywhere = Viewer(rig, reference, images)
     fits = {number: viewer.fitted(image) for number, image in enumerate(images)}
+    unfitted = [image for image, fit in zip(images, fits.values(), strict=True) if fit is None]
     left_out: dict[int, str] = {}
     while True:
         used = [images[number] for number in fits]
@@ -104,19 +106,44 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
         except ImageRefused as refused:
             number = next(n for n in fits if images[n].image is refused.image.image)
             if 2 * (len(fits) - 1) <= len(images):
-                raise _with_reasons(refused, left_out) from None
+                raise _with_reasons(refused, left_out, _astray(everywhere, unfitted, len(images))) from None
             del fits[number]
             left_out[number] = str(refused)
         except TeachingRefused as refused:
-            raise _with_reasons(refused, left_out) from None
+            raise _with_reasons(refused, left_out, _astray(everywhere, unfitted, len(images))) from None
 
 
-def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
-    """The refusal, with the images that were left out before, each with its reason, as notes."""
+def _astray(viewer: Viewer, unfitted: Sequence[TeachingImage], count: int) -> str:
+    """What a refusal says first where several, but not all, of ``count`` images show nothing of the gripper at the
+    reference.
+    """
+    absent = [image for image in unfitted if _nothing_of_it(viewer, image)]
+    if not 1 < len(absent) < count:
+        return ""
+    right = "images at one jaw opening, for which the gripper file holds"
+    if viewer.gripper.has_jaw:
+        right = "each image with its own jaw opening (jaw_opening_m in timestamps.csv, jaw.source: frames)"
+    return (
+        f"{len(absent)} of {count} images ({absent[0].name} to {absent[-1].name}) don't show the gripper at the "
+        f"reference, the others do: the jaws or the camera stood elsewhere in them, or something hides it; {right}"
+    )
+
+
+def _nothing_of_it(viewer: Viewer, image: TeachingImage) -> bool:
+    view = viewer.view(image, None)
+    return is_absent(viewer, view, _lines(viewer, [view], search=True)[0])
+
+
+def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str], astray: str) -> TeachingRefused:
+    """The refusal, with the images that were left out before, each with its reason, as notes; ``astray`` instead of it
+    where that says more.
+    """
+    reasons = [f"left out: {why}" for why in left_out.values()]
+    if astray:
+        return TeachingRefused(astray, [*reasons, str(refused), *refused.notes])
     if not left_out:
         return refused
     count = f"{len(left_out)} image{'s' * (len(left_out) > 1)}"
-    reasons = [f"left out: {why}" for why in left_out.values()]
     return TeachingRefused(f"{refused}; and left out before: {count}", [*reasons, *refused.notes])
 
 

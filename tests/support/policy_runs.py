@@ -53,6 +53,7 @@ def seen(
     protection: Protection | None = BOUNDED,
     where_it_was: bool = False,
     unproven: bool = False,
+    believed: bool = True,
 ) -> Evidence:
     """A measured frame: the TCP shifted along the camera's x axis, turned about z; any shift is one that the drift test
     has found unless ``present`` says otherwise.
@@ -75,6 +76,7 @@ def seen(
         stream_at_fault,
         protection,
         where_it_was,
+        believed=believed,
         unproven=unproven,
     )
 

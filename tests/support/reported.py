@@ -121,7 +121,7 @@ def said(run: list[FrameRecord], i: int, **changes: object) -> None:
         AlertKind.STEP,
         Cause.CAMERA_MOUNT,
         Severity.ERROR,
-        "a step: TCP now 3 mm from where the reference had it",
+        "a step: at 22:13:25 the TCP was 3 mm from where the reference had it",
         event=AlertEvent.RAISED,
         alert_id="1-a",
         since_ns=run[i].stamp_ns,

@@ -42,10 +42,21 @@ class Baseline:
             self._first.append(shift)
             if len(self._first) < self._frames:
                 return None
-            mean = _mean_of_the_inner_half(_before_a_step(np.array(self._first)))
-            self.error = mean if (np.abs(mean) <= self._allowed).all() else np.zeros(6)
-            self._first.clear()
+            self._settle()
+        assert self.error is not None
         return shift - self.error
+
+    def knocked(self) -> None:
+        """The mount was knocked before the next frame: those so far have to do, lest a knock soon after the start is
+        told only once there are as many frames as usual.
+        """
+        if self.error is None and self._first:
+            self._settle()
+
+    def _settle(self) -> None:
+        mean = _mean_of_the_inner_half(_before_a_step(np.array(self._first)))
+        self.error = mean if (np.abs(mean) <= self._allowed).all() else np.zeros(6)
+        self._first.clear()
 
 
 def _before_a_step(shifts: Array) -> Array:

@@ -31,7 +31,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.model.units import in_degrees, in_mm
+from gripmon.model.units import in_degrees, in_mm, in_time
 from gripmon.track.edges import VAGUE_M, VAGUE_RAD
 
 NO_REFERENCE = (*NOT_THE_CAMERA, Cause.CAMERA_REPLACED)
@@ -86,6 +86,11 @@ class Evidence:
     old: bool = False
 
     @property
+    def elsewhere(self) -> bool:
+        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image."""
+        return not (self.believed or self.where_it_was or self.old)
+
+    @property
     def moved(self) -> bool:
         """Whether the camera has moved, by more than it swings to and fro anyway."""
         if not self.motion.present or self.swing is None:
@@ -117,13 +122,14 @@ class Policy:
         self._since_jump = 0
         self._still = 0
         self._still_shift: Array = np.zeros(6)
-        self._bad_since_s: float | None = None
-        self._unproven_since: tuple[float, int] | None = None  # by the frames' time, s, and by their stamps, ns
+        self._bad_since: tuple[float, int] | None = None  # by the frames' time, s, and by their stamps, ns
+        self._unproven_since: tuple[float, int] | None = None  # likewise
+        self._unproven_text = ""  # as it was first told: figures in it change with every frame
 
     def measured(self, evidence: Evidence, now_s: float, stamp_ns: int) -> Judgement:
         """A frame from which a transform could be measured."""
         settings, probable = self._settings, evidence.explanation.probable
-        self._bad_since_s = None
+        self._bad_since = None
         self._since_jump = 1 if evidence.jumped else self._since_jump + 1
         self._count_still(evidence)
         confirmed = evidence.where_it_was or self._since_jump >= settings.confirm_frames
@@ -143,10 +149,10 @@ class Policy:
         self.state = state
         beyond = past_alert_limit(evidence.protection, settings)
         reason = self._doubt(evidence, confirmed, beyond)
-        if beyond is None or not evidence.unproven:
+        if not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
             self._unproven_since = None
         elif self._unproven_since is None:
-            self._unproven_since = now_s, stamp_ns
+            self._unproven_since, self._unproven_text = (now_s, stamp_ns), ""
         verdict = Verdict.VALID if reason is None else Verdict.SUSPECT
         return Judgement(state, verdict, self._alerts_of(evidence, moved, now_s, stamp_ns), recalibrate, reason)
 
@@ -179,9 +185,9 @@ class Policy:
         """
         settings, book = self._settings, self.alerts
         self._since_jump = self._still = 0
-        if self._bad_since_s is None:
-            self._bad_since_s = now_s
-        lasted_s = now_s - self._bad_since_s
+        if self._bad_since is None:
+            self._bad_since = now_s, stamp_ns
+        lasted_s, begun = now_s - self._bad_since[0], in_time(self._bad_since[1])
         held = measured_s is not None and now_s - measured_s <= settings.hold_s
         if held:
             # A bad image says nothing about the gripper: only time makes it lost.
@@ -195,10 +201,10 @@ class Policy:
             explanation = NO_EXPLANATION  # of a motion before
         probable = explanation.confirmed_cause
         if self.state is State.LOST:
-            what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
+            what = f"frames have been refused ({refusal})" if refusal else "the gripper has not been found"
             cause = self._bad(explanation) if refusal else probable.cause
             why = "" if refusal else explanation.text
-            text = f"{what} for {lasted_s:.1f} s; no transform is given" + (f"; {why}" if why else "")
+            text = f"{what} since {begun}; no transform is given" + (f"; {why}" if why else "")
             lost = Alert(AlertKind.LOST, cause, Severity.ERROR, text, part=probable.part, causes=explanation.causes)
             alerts += book.present(Topic.VIEW, lost, now_s, stamp_ns)
         elif self.state is State.OCCLUDED:
@@ -214,7 +220,7 @@ class Policy:
             told = occluded if before is None or (before.kind is AlertKind.OCCLUDED and not lasts) else before
             alerts += book.present(Topic.VIEW, told, now_s, stamp_ns)
         if refusal and lasted_s >= settings.image_alert_after_s:
-            text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
+            text = f"frames have been refused since {begun}: {refusal}"
             bad = Alert(AlertKind.IMAGE, self._bad(explanation), Severity.ERROR, text)
             alerts += book.present(Topic.IMAGE, bad, now_s, stamp_ns)
         elif not refusal:
@@ -312,7 +318,10 @@ class Policy:
             return ()  # usually: nothing to raise, to update or to clear
         if since is not None and now_s - since[0] >= self._settings.hold_s:
             # As long as a transform is held of which nothing is seen.
-            text = unproven_text(since[1])
+            if not self._unproven_text:
+                there = evidence.shift if evidence.elsewhere else None
+                self._unproven_text = unproven_text(since[1], there, stamp_ns)
+            text = self._unproven_text
             unproven = Alert(AlertKind.OCCLUDED, Cause.UNKNOWN, Severity.WARNING, text)
             before = book.about(Topic.VIEW)
             alerts = book.present(
@@ -323,7 +332,7 @@ class Policy:
         alerts += book.absent(Topic.IMAGE, "images are good again", now_s)
         # A fault of the gripper or the lens has one alert, about that.
         if moved and (not not_the_camera or book.about(Topic.MOTION) is not None):
-            alerts += book.present(Topic.MOTION, self._motion_alert(evidence), now_s, stamp_ns)
+            alerts += book.present(Topic.MOTION, self._motion_alert(evidence, stamp_ns), now_s, stamp_ns)
         else:
             alerts += book.absent(Topic.MOTION, "the camera is where the reference has it", now_s)
         vibration = motion.vibration
@@ -348,7 +357,7 @@ class Policy:
             alerts += book.absent(Topic.GRIPPER, "fingers, jaw and lens are as they should be", now_s)
         return alerts
 
-    def _motion_alert(self, evidence: Evidence) -> Alert:
+    def _motion_alert(self, evidence: Evidence, stamp_ns: int) -> Alert:
         settings, motion, explanation = self._settings, evidence.motion, evidence.explanation
         shift_m, turn_rad = float(np.linalg.norm(motion.shift[:3])), float(np.linalg.norm(motion.shift[3:]))
         past_warning = max(shift_m / settings.warn_m, turn_rad / settings.warn_rad)
@@ -358,7 +367,7 @@ class Policy:
             rate = motion.creep.rate_m_per_min
             left_s = time_left_s(motion.shift, motion.creep.velocity, settings.limit_m, settings.limit_rad)
         x, y, z = motion.shift[:3].tolist()
-        parts = [motion_text(motion, evidence.since_first), creep_text(rate, left_s), explanation.text]
+        parts = [motion_text(motion, evidence.since_first, stamp_ns), creep_text(rate, left_s), explanation.text]
         return Alert(
             kind=motion.kind,
             cause=explanation.confirmed_cause.cause,
