@@ -103,6 +103,26 @@ def test_residuals_are_distances_in_the_image_and_their_derivatives_hold(lens: L
         np.testing.assert_allclose(jacobian[:, unknown] / scale, (before - after) / 2e-6 / scale, atol=3e-3)
 
 
+def test_a_step_that_leaves_the_view_is_not_taken(monkeypatch: pytest.MonkeyPatch):
+    """Behind the camera nothing is projected: the fit stays where it was, and its evidence is a number."""
+    shown = Shown(sharp_gripper(), seed=5)
+    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
+    view, gripper = EdgeView(shown.camera, shown.gripper, evidence), shown.gripper
+    start, seen = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6))), view.residual
+
+    def residual(state: State) -> tuple[np.ndarray, np.ndarray]:
+        residual, jacobian = seen(state)
+        return residual + (0.0 if state.jaw_opening_m == OPENING_M else np.nan), jacobian
+
+    monkeypatch.setattr(view, "residual", residual)
+    held, freed = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12)
+    freed[JAW] = 1.0
+    edge = np.unique(evidence.edge, return_inverse=True)[1]
+    errors = Errors(np.zeros(len(edge)), np.full(len(edge), 0.2), np.full(len(edge), 1e-6), edge)
+    found = weigh(view, gripper, Model(held, freed, np.array([1e-3])), start, start, errors)
+    assert np.isfinite(found.log_evidence) and found.state.jaw_opening_m == OPENING_M
+
+
 def test_the_evidence_is_the_integral_over_the_prior():
     """One free unknown, the opening, and edges without an error of their own: quadrature does it, too."""
     shown = Shown(sharp_gripper(), seed=5)

@@ -276,9 +276,11 @@ class _Problem:
         return _Point(state, off_px, residual - self._errors.bias_px, state.since(self._start), design)
 
     def _moved(self, point: _Point, step: Array) -> _Point:
+        """The point a step farther; the same one where the gripper would be behind the camera."""
         full = np.zeros(len(point.motion))
         full[self._free] = step[: len(self._free)]
-        return self.point(point.state.moved(full, self._gripper), point.off_px + step[len(self._free) :])
+        moved = self.point(point.state.moved(full, self._gripper), point.off_px + step[len(self._free) :])
+        return moved if np.isfinite(moved.residual).all() else point
 
     def _step(self, point: _Point, weight: Array, spread_weight: Array) -> Array:
         """(n + k,) of the unknowns and the offsets."""
