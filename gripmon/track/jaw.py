@@ -95,6 +95,7 @@ class JawKnowledge:
         self._alike = AlikeErrors()
         self._seen: tuple[float, float] | None = None
         self._doubted_m: float | None = None  # the report since which images contradict what is known
+        self._against = 0  # so many
         self._forget()
 
     @property
@@ -151,6 +152,7 @@ class JawKnowledge:
         return min(float(self._covariance.sum()) + SYSTEMATIC_M**2, self.report_sigma_m**2)
 
     def _forget(self) -> None:
+        self._learnt = 0  # from so many images
         self._mean = np.zeros(2)
         self._covariance = np.diag([self._offset_sigma_m**2, self._sigma_m**2])
 
@@ -171,17 +173,19 @@ class JawKnowledge:
 
         Images err alike while the background stands still: how much less than independent ones their errors differ from
         one to the next tells how many of them count as one.  What contradicts what is known is more probably an edge of
-        something held between the fingers than a jaw that moved without a report: it isn't learnt before the jaw is
-        elsewhere and it still does, and then instead of all before.
+        something held between the fingers than a jaw that moved without a report: it isn't learnt before it is more
+        images in a row than what is known is made of, or the jaw is elsewhere; and then instead of all before.
         """
         error_m, variance, contradicted = seen
         if contradicted and self._reported_m is not None:
+            self._against += 1
             if self._doubted_m is None:
                 self._doubted_m = self._reported_m
-            if self._left(self._reported_m - self._doubted_m) > FORGOTTEN:
+            here = self._left(self._reported_m - self._doubted_m) > FORGOTTEN
+            if here and self._against <= self._learnt:
                 return
             self._forget()
-        self._doubted_m = None
+        self._doubted_m, self._against, self._learnt = None, 0, self._learnt + 1
         if self._seen is not None:
             before_m, before = self._seen
             self._alike.learn((error_m - before_m) ** 2 / (variance + before))
