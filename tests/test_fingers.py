@@ -124,7 +124,7 @@ def test_soft_shading_that_comes_and_goes_on_a_plain_body_is_no_background():
 
 
 def test_a_small_face_on_which_shadows_come_and_go_is_the_grippers():
-    """Beside a finger at the image's border, smaller than a cell: by how much of it changes, it began as background."""
+    """Beside a finger at the image's border, smaller than a cell: hardly any of it is a pixel away from its edges."""
     pad = [(100, 229), (112, 229), (112, 239), (100, 239)]
     own = polygons(pad)
     face, shown = cv2.GaussianBlur(own.astype(np.float32), (0, 0), 0.8), []
@@ -132,9 +132,7 @@ def test_a_small_face_on_which_shadows_come_and_go_is_the_grippers():
         shadow = np.zeros(SHAPE, np.float32)
         shadow[:, 106:112] = 60.0 if k % 4 <= 1 else 0.0
         shown.append(picture + face * (50.0 + shadow))
-    edges = edges_that_stay(shown)
-    assert 0.3 < edges.changing[own].mean() < 0.5 * edges.most_changing
-    found = enclosed(edges)
+    found = enclosed(edges_that_stay(shown))
     assert found is not None and found[own].mean() > 0.7
 
 

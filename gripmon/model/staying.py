@@ -42,6 +42,8 @@ NOISE_SLOPES = 3.0
 """The same, in the slopes that noise alone makes: one in a hundred of these is larger (Rayleigh: exp(-4.5))."""
 STAYING_PART = 0.35
 """Where between chance (0) and all images (1) an edge stays: a third of the images may show something else there."""
+SURELY_STAYS = 0.6
+"""Share from which, if that is more, what is there isn't counted as coming and going: most images show it."""
 CHANGING_SLOPES = 4.0
 """Slope that a fifth of the images show, over noise's: noise exceeds it in one of 3,000 (Rayleigh: exp(-8)).  At least
 that of an edge that counts: shading and a coder's errors come and go on a plain body as well."""
@@ -120,7 +122,9 @@ def edges_that_stay(images: Sequence[Plane]) -> Edges:
     chance, _ = _share(_displaced(images), full)
     changing = (high > max(CHANGING_SLOPES * noise, LEAST_SLOPE)) & (high > CHANGING_FACTOR * usual)
     edges = Edges(share, across_rad, _ridge(usual, across_rad), changing, float(chance.mean()), usual)
-    return replace(edges, changing=changing & (share < max(edges.limit, 0.6)))
+    # A pixel beside an edge that surely stays its own blur and play change.
+    surely = (share >= max(edges.limit, SURELY_STAYS)).astype(np.uint8)
+    return replace(edges, changing=changing & (cv2.dilate(surely, np.ones((3, 3), np.uint8)) == 0))
 
 
 def gradient(image: Plane) -> tuple[Plane, Plane]:

@@ -31,8 +31,8 @@ PRONGS_SHARE = 0.5
 ALIKE_OUTLINES = 0.3
 """Least outline of a second finger over the first one's; what is shorter is taken for something else."""
 ALIKE_SHARES = 0.8
-"""Least mean share of the images that show an edge along a part's outline, over that of the part with the longest one:
-before the same backgrounds two fingers' outlines are seen about equally often, those of chance less."""
+"""Least part of an outline along which an edge stays, over that of the part with the longest one: of what edges enclose
+by chance about half.  In how many images it shows depends on a part's own grey."""
 _BOTTOM = 0.9
 _FLANK = (0.2, 0.7)  # parts of a valley's depth: above, a finger's end that is farther back than the other one's
 _BORDER_PX = 2
@@ -115,10 +115,9 @@ def _inside_box(still: Bits, box: Box) -> Bits:
 def _candidates(still: Bits, strength: Plane, limit: float) -> list[_Part]:
     """Parts that may be fingers, those with the longest outline first."""
     found = [own for part in _connected(still) for own in _divided(part) if own[2] >= SHORTEST_OUTLINE_PX]
-    shares = [_mean_along(own[0], still, strength) for own in found]
+    shares = [_stays_along(own[0], still, strength, limit) for own in found]
     longest = int(np.argmax([own[2] * share for own, share in zip(found, shares, strict=True)])) if found else 0
-    least = max(limit, ALIKE_SHARES * shares[longest]) if found else limit
-    found = [own for own, share in zip(found, shares, strict=True) if share > least]
+    found = [own for own, share in zip(found, shares, strict=True) if share > ALIKE_SHARES * shares[longest]]
     if any(enters for *_, enters in found):  # what floats in the view is a mark on the lens, a stamp, a reflection
         found = [own for own in found if own[3]]
     return sorted(found, key=lambda own: -own[2])
@@ -271,10 +270,10 @@ def _outline(mask: Bits, part: Bits) -> Bits:
     return mask & (cv2.erode(part.astype(np.uint8), cross, borderValue=1) == 0) & ~_at_border(mask.shape)
 
 
-def _mean_along(mask: Bits, still: Bits, strength: Plane) -> float:
-    """Mean share of the images that show an edge along a part's outline, to a pixel or two."""
+def _stays_along(mask: Bits, still: Bits, strength: Plane, limit: float) -> float:
+    """Part of an outline along which an edge stays, to a pixel or two."""
     near = cv2.dilate(strength, np.ones((3, 3), np.uint8))
-    return float(near[_outline(mask, still)].mean())
+    return float((near[_outline(mask, still)] > limit).mean())
 
 
 def _root(mask: Bits) -> Array:
