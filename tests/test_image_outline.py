@@ -9,17 +9,10 @@ from support.changing_backgrounds import CAMERA
 
 from gripmon.model.staying import Edges, edges_that_stay
 from gripmon.teach.beyond import Background, is_outermost
-from gripmon.teach.image_outline import _displaced, _moved_back, _Shown, _shown
+from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
 from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px
-from gripmon.teach.straight_pieces import _is_smooth, _joined, _Line
-
-
-def _matte(images: np.ndarray, still: bool = False) -> Matte:
-    """Of ``images`` (n, h, w) in which nothing, or all, belongs to what stays."""
-    flat, count = np.zeros(images.shape[1:], np.float32), len(images)
-    edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
-    return Matte(np.full(flat.shape, still), edges, 1.0, images, np.zeros((count, 2)), tuple(range(count)), {})
+from gripmon.teach.straight_pieces import _joined, _Line
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
@@ -34,36 +27,20 @@ def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
     normal = np.column_stack([np.cos(angle), np.sin(angle)])
     uv_px = np.array([150.0, 100.0]) + normal * [100.0, 60.0]
+    stations = Stations(uv_px, normal, np.ones(len(angle), bool))
     seen = np.zeros((3, len(angle)))
     seen[0] = ((uv_px @ matrix[:, :2].T + matrix[:, 2] - uv_px) * normal).sum(axis=1)
     usable = uv_px[:, 0] > 180.0
-    shown = _Shown(uv_px[usable], normal[usable], seen[:, usable], np.ones((3, np.count_nonzero(usable))))
-    back = _moved_back(_matte(images), _displaced(shown), shown.uv_px).images
+    none = np.zeros(len(angle))
+    found = Transitions(none, none[None], usable, 0.7, seen, np.ones((3, len(angle))), np.ones(3), *3 * (none,))
+    flat = np.zeros(shape, np.float32)
+    edges = Edges(flat, flat, flat > 0, flat > 0, 0.0)
+    matte = Matte(flat > 0, edges, 1.0, images, np.zeros((3, 2)), (0, 1, 2), {})
+
+    back = _moved_back(matte, _displaced(stations, found), uv_px[usable]).images
     inner = np.s_[20:-20, 20:-20]
     off, off_before = (np.abs(image[inner] - usual[inner]).max() for image in (back[0], turned))
     assert off < 0.1 * off_before
-
-
-@pytest.mark.parametrize("plain", [False, True])
-def test_edges_within_show_how_far_a_finger_is_displaced_along_itself(plain: bool) -> None:
-    """Two straight sides show no motion along them; the border of its two tones does, each in a light of its own."""
-    rng, along_px = np.random.default_rng(4), np.array([0.0, 0.0, 0.0, 1.1, -0.8])
-    images = []
-    for shift_px in along_px:
-        light = 1.0 + 0.05 * rng.normal(size=2)
-        fine = np.full((400, 400), 60.0 * light[0])
-        if not plain:
-            fine[round(4.0 * (50.0 + shift_px)) :] = 90.0 * light[1]
-        soft = cv2.resize(cv2.GaussianBlur(fine, (0, 0), 4.0), (100, 100), interpolation=cv2.INTER_AREA)
-        images.append(soft + rng.normal(size=(100, 100)))
-    side = np.column_stack([np.repeat([20.0, 80.0], 60), np.tile(np.arange(20.0, 80.0), 2)])
-    normal = np.repeat([[-1.0, 0.0], [1.0, 0.0]], 60, axis=0)
-    one, none = np.ones((5, 120)), np.zeros(120)
-    found = Transitions(none, one, none == 0.0, 0.7, 0.0 * one, 900.0 * one, one[0], *3 * (none,))
-    matte = _matte(np.array(images, np.float32), still=True)
-    moved_px = _displaced(_shown(matte, Stations(side, normal, none == 0.0), found))
-    assert np.abs(moved_px[:, 0]).max() < 0.1
-    assert np.abs(moved_px[:, 1] - (0.0 if plain else along_px)).max() < 0.25
 
 
 @pytest.mark.parametrize("texture_dn", [0.0, 30.0])
@@ -124,13 +101,3 @@ def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() ->
     chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
     assert not chain.corner.any()
     assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01
-
-
-def test_pieces_that_pass_each_other_at_a_step_are_no_curve() -> None:
-    """Halfway between two parallel lines a vertex lay beside both."""
-    for step_px, smooth in ((0.2, True), (8.0, False)):
-        ends = [np.array([[0.0, 0.0], [20.0, 0.0]]), np.array([[24.0, step_px], [120.0, step_px]])]
-        lines = [
-            _Line(np.array([0.0, 1.0]), float(end[0, 1]), np.zeros((0, 2)), np.zeros(0), 0.05, end) for end in ends
-        ]
-        assert _is_smooth(((0, 1), lines[0]), ((2, 3), lines[1]), np.vstack(ends)) == smooth

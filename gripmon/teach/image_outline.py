@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,23 +13,13 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
-from gripmon.model.staying import LEAST_SLOPE, Bits, Plane, gradient
+from gripmon.model.staying import Bits, Plane
 from gripmon.teach.beyond import Background
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
-from gripmon.teach.silhouette import (
-    CLEAR_NOISES,
-    NARROW_PX,
-    STEP_PX,
-    Stations,
-    Transitions,
-    across,
-    measure_transitions,
-    stations_along,
-    trace,
-)
+from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
 from gripmon.teach.straight_pieces import STRAIGHT_PX, Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
@@ -43,8 +32,6 @@ LEAST_SHARPNESS = 0.6
 """Least sharpness of an image's transitions over that of all: an image blurred to 1.7 times their width has less."""
 LEAST_SEEN = 0.7
 """Least part of a finger's outline in view that is measured: with less, what is missing may be its tip."""
-MOST_WITHIN = 500
-"""About how many places on edges within the fingers tell an image's displacement: as many as along an outline."""
 _TURNS = 4
 
 
@@ -107,11 +94,10 @@ def see_opening(
                 )
             matte = _without(matte, bad)
         elif turn + 1 < _TURNS:
-            shown = _shown(matte, stations, found)
-            moved = _displaced(shown)
+            moved = _displaced(stations, found)
             if np.abs(moved).max() < LEAST_PLAY_PX:
                 break
-            matte = _moved_back(matte, moved, shown.uv_px)
+            matte = _moved_back(matte, moved, stations.uv_px[found.usable])
         step()
     seen, borders = _fingers(camera, matte, contours, parts, found.blur_px, step)
     return OpeningSeen(matte, seen, left_out, found.blur_px, parts.rest, borders)
@@ -171,77 +157,34 @@ def _middle(at_px: Array) -> tuple[Array, float]:
     return centre, float(np.sqrt(np.square(at_px - centre).sum(axis=1).mean()))
 
 
-class _Shown(NamedTuple):
-    """Where edges show how far images are displaced: ``uv_px`` and ``normal`` (s, 2), ``shift_px`` (n, s) along these,
-    and its information ``worth`` (n, s), the squared contrast.
+def _displaced(stations: Stations, found: Transitions) -> Array:
+    """How far (n, 3) each image shows the outline beside where all do: a shift, and a turn about the centre of its
+    usable stations, in pixels at their usual distance from it (:func:`_middle`); robust least squares.
     """
-
-    uv_px: Array
-    normal: Array
-    shift_px: Array
-    worth: Array
-
-
-def _shown(matte: Matte, stations: Stations, found: Transitions) -> _Shown:
-    """By the outline, before backgrounds that show it, and by edges within, before all: without these nothing tells an
-    image's displacement along a finger whose tip hardly shows in it.  What is clear counts the same whatever its
-    contrast: the few places before something white outvoted a tip before grey.
-    """
-    use = found.usable
-    outline = stations.uv_px[use], stations.normal[use], found.shift_px[:, use], found.worth[:, use]
-    pairs = enumerate(zip(outline, _within(matte), strict=True))
-    uv_px, normal, shift_px, worth = (np.concatenate(pair, axis=k // 2) for k, pair in pairs)
-    return _Shown(uv_px, normal, shift_px, np.minimum(worth, (CLEAR_NOISES * max(matte.noise, 1.0)) ** 2))
-
-
-def _within(matte: Matte) -> _Shown:
-    """By the gripper's own edges: profiles across them, each in a light and on a level of its own, to first order."""
-    x, y = gradient(matte.mean)
-    slope = np.hypot(x, y)
-    depth = cv2.distanceTransform(matte.still.astype(np.uint8), cv2.DIST_L2, 5)
-    crest = (slope >= cv2.dilate(slope, np.ones((3, 3), np.uint8))) & (slope > LEAST_SLOPE) & (depth > NARROW_PX)
-    at = np.argwhere(crest)[:, ::-1]
-    at = at[:: 1 + len(at) // MOST_WITHIN]
-    if not len(at):
-        none = np.zeros((len(matte.images), 0))
-        return _Shown(np.zeros((0, 2)), np.zeros((0, 2)), none, none)
-    normal = np.column_stack([part[at[:, 1], at[:, 0]] for part in (x, y)]) / slope[at[:, 1], at[:, 0], None]
-    stations = Stations(at.astype(float), normal, np.ones(len(at), bool))
-    s = np.arange(-0.5 * NARROW_PX, 0.5 * NARROW_PX + 0.25, STEP_PX)
-    usual = across(matte.mean[None], stations, s)[0]
-    fit = np.linalg.pinv(np.stack([usual, np.gradient(usual, s, axis=1), np.ones_like(usual)], axis=2))
-    light, less, _ = np.einsum("skj,nsj->kns", fit, across(matte.images, stations, s))
-    worth = np.where(light > 0.5, np.square(np.ptp(usual, axis=1)), 0.0)
-    return _Shown(stations.uv_px, normal, -less / np.maximum(light, 0.5), worth)
-
-
-def _displaced(shown: _Shown) -> Array:
-    """How far (n, 3) each image shows edges beside where all do: a shift, and a turn about the centre of these, in
-    pixels at their usual distance from it (:func:`_middle`); robust least squares.
-    """
-    centre, size = _middle(shown.uv_px)
-    normal, arm = shown.normal, shown.uv_px - centre
+    chosen = found.usable
+    centre, size = _middle(stations.uv_px[chosen])
+    normal, arm = stations.normal[chosen], stations.uv_px[chosen] - centre
     design = np.column_stack([normal, (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / size])
-    out = np.zeros((len(shown.worth), 3))
-    shift, trust = np.clip(shown.shift_px, -4.0, 4.0), np.ones(len(normal))
+    out = np.zeros((len(found.worth), 3))
+    shift, trust = np.clip(found.shift_px[:, chosen], -4.0, 4.0), np.ones(np.count_nonzero(chosen))
     for _ in range(2):
         for k in range(len(out)):
-            out[k] = _robust(design, shift[k], np.sqrt(shown.worth[k] * trust))
+            out[k] = _robust(design, shift[k], np.sqrt(found.worth[k, chosen] * trust))
         # Beside a face of the gripper each background shows the edge elsewhere, whatever moved.
         off = shift - (out - np.median(out, axis=0)) @ design.T
         off = np.square(off - np.median(off, axis=0))
-        scatter = np.average(off, axis=0, weights=shown.worth + 1e-9)
+        scatter = np.average(off, axis=0, weights=found.worth[:, chosen] + 1e-9)
         trust = 1.0 / np.maximum(scatter, STRAIGHT_PX**2)
     return np.asarray(out - np.median(out, axis=0))
 
 
 def _robust(design: Array, wanted: Array, worth: Array) -> Array:
-    """Least squares with weights (s,), by Huber's loss: one that gives up what is far off gave up tips."""
+    """Least squares with weights (s,), without outliers."""
     weight = worth.copy()
     for _ in range(6):
         out = np.linalg.lstsq(design * weight[:, None], wanted * weight, rcond=1e-3)[0]
         off = np.abs(wanted - design @ out)
-        weight = worth / np.sqrt(np.maximum(off / max(1.4826 * float(np.median(off)), 0.05), 1.0))
+        weight = worth / np.maximum(off / max(1.4826 * float(np.median(off)), 0.05), 1.0)
     return np.asarray(out)
 
 
