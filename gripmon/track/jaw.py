@@ -18,11 +18,6 @@ from gripmon.model.records import Array
 UNREPORTED_MOTION_SIGMAS = 5.0
 """Standard deviations between what is known and what an image shows past which the jaw has moved without a report."""
 
-FORGOTTEN = 1e-3
-"""What a way of the jaw has left of the part of the report's error that changes, from which it counts as another place:
-what is held between the fingers is at one, and the offset at all.
-"""
-
 SYSTEMATIC_M = 2e-6
 """What no number of images tells about the opening: a fiftieth of a pixel at 100 µm a pixel."""
 
@@ -156,12 +151,9 @@ class JawKnowledge:
         self._mean = np.zeros(2)
         self._covariance = np.diag([self._offset_sigma_m**2, self._sigma_m**2])
 
-    def _left(self, way_m: float) -> float:
-        return math.exp(-abs(way_m) / (2.0 * self._sigma_m))
-
     def _travel(self, reported_m: float) -> None:
         if self._reported_m is not None and not self.exact:
-            kept = self._left(reported_m - self._reported_m)
+            kept = math.exp(-abs(reported_m - self._reported_m) / (2.0 * self._sigma_m))
             keep = np.array([1.0, kept])
             self._mean *= keep
             self._covariance *= np.outer(keep, keep)
@@ -181,8 +173,9 @@ class JawKnowledge:
             self._against += 1
             if self._doubted_m is None:
                 self._doubted_m = self._reported_m
-            here = self._left(self._reported_m - self._doubted_m) > FORGOTTEN
-            if here and self._against <= self._learnt:
+            # What the jaw's old place tells of the report's error here, as a share of the information.
+            left = math.exp(-abs(self._reported_m - self._doubted_m) / self._sigma_m)
+            if left > LEAST_INFORMATION_RATIO and self._against <= self._learnt:
                 return
             self._forget()
         self._doubted_m, self._against, self._learnt = None, 0, self._learnt + 1

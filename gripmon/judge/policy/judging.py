@@ -149,7 +149,9 @@ class Policy:
         self.state = state
         beyond = past_alert_limit(evidence.protection, settings)
         reason = self._doubt(evidence, confirmed, beyond)
-        if not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
+        # A fault of the gripper or the lens has an alert of its own, and nothing proves a place with it.
+        faulty = evidence.explanation.confirmed_cause.cause in NOT_THE_CAMERA
+        if faulty or not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
             self._unproven_since = None
         elif self._unproven_since is None:
             self._unproven_since, self._unproven_text = (now_s, stamp_ns), ""
