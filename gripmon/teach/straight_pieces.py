@@ -481,12 +481,9 @@ def _joined(camera: Camera, ideal: Array, lines: list[_Line], spans: list[tuple[
 
 
 def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
-    """Whether two pieces approximate a curve, instead of meeting in a corner or passing each other at a step."""
+    """Whether two pieces approximate a curve, instead of meeting in a corner."""
     shorter_px = min(float(np.linalg.norm(ideal[last] - ideal[first])) for (first, last), _ in (before, after))
-    joint = 0.5 * (before[1].ends[1] + after[1].ends[0])
-    feet = [_foot(line.normal[None], np.array([line.distance]), joint)[0] for _, line in (before, after)]
-    step_px = 0.5 * float(np.linalg.norm(feet[1] - feet[0]))
-    return max(shorter_px * _turn(before[1].normal, after[1].normal) / 8.0, step_px) <= CORNER_SAG_PX
+    return shorter_px * _turn(before[1].normal, after[1].normal) / 8.0 <= CORNER_SAG_PX
 
 
 def _turn(a: Array, b: Array) -> float:
