@@ -89,8 +89,8 @@ class JawKnowledge:
         self._reported_m: float | None = None
         self._alike = AlikeErrors()
         self._seen: tuple[float, float] | None = None
-        self._doubted_m: float | None = None  # the report since which images contradict what is known
-        self._against = 0  # so many
+        self._against = 0  # so many images in a row contradict what is known
+        self._doubted_m = 0.0  # the report in the first of them
         self._forget()
 
     @property
@@ -170,15 +170,15 @@ class JawKnowledge:
         """
         error_m, variance, contradicted = seen
         if contradicted and self._reported_m is not None:
-            self._against += 1
-            if self._doubted_m is None:
+            if not self._against:
                 self._doubted_m = self._reported_m
+            self._against += 1
             # What the jaw's old place tells of the report's error here, as a share of the information.
             left = math.exp(-abs(self._reported_m - self._doubted_m) / self._sigma_m)
             if left > LEAST_INFORMATION_RATIO and self._against <= self._learnt:
                 return
             self._forget()
-        self._doubted_m, self._against, self._learnt = None, 0, self._learnt + 1
+        self._against, self._learnt = 0, self._learnt + 1
         if self._seen is not None:
             before_m, before = self._seen
             self._alike.learn((error_m - before_m) ** 2 / (variance + before))
