@@ -88,7 +88,6 @@ class JawKnowledge:
         self._sigma_m, self._offset_sigma_m = sigma_m, 0.0 if self.exact else offset_sigma_m
         self._reported_m: float | None = None
         self._alike = AlikeErrors()
-        self._seen: tuple[float, float] | None = None
         self._against = 0  # so many images in a row contradict what is known
         self._doubted_m = 0.0  # the report in the first of them
         self._forget()
@@ -148,6 +147,7 @@ class JawKnowledge:
 
     def _forget(self) -> None:
         self._learnt = 0  # from so many images
+        self._seen: tuple[float, float] | None = None  # by the last of them
         self._mean = np.zeros(2)
         self._covariance = np.diag([self._offset_sigma_m**2, self._sigma_m**2])
 

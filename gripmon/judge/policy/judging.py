@@ -149,9 +149,7 @@ class Policy:
         self.state = state
         beyond = past_alert_limit(evidence.protection, settings)
         reason = self._doubt(evidence, confirmed, beyond)
-        # A fault of the gripper or the lens has an alert of its own, and nothing proves a place with it.
-        faulty = evidence.explanation.confirmed_cause.cause in NOT_THE_CAMERA
-        if faulty or not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
+        if not (_elsewhere(evidence) or (evidence.unproven and beyond is not None)):
             self._unproven_since = None
         elif self._unproven_since is None:
             self._unproven_since, self._unproven_text = (now_s, stamp_ns), ""
@@ -321,7 +319,7 @@ class Policy:
         if since is not None and now_s - since[0] >= self._settings.hold_s:
             # As long as a transform is held of which nothing is seen.
             if not self._unproven_text:
-                there = evidence.shift if evidence.elsewhere else None
+                there = evidence.shift if _elsewhere(evidence) else None
                 self._unproven_text = unproven_text(since[1], there, stamp_ns)
             text = self._unproven_text
             unproven = Alert(AlertKind.OCCLUDED, Cause.UNKNOWN, Severity.WARNING, text)
@@ -382,6 +380,11 @@ class Policy:
             rate_m_per_min=rate,
             time_left_s=left_s,
         )
+
+
+def _elsewhere(evidence: Evidence) -> bool:
+    """Whether it is to be told that the gripper is elsewhere: a fault of gripper or lens has an alert of its own."""
+    return evidence.elsewhere and evidence.explanation.confirmed_cause.cause not in NOT_THE_CAMERA
 
 
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
