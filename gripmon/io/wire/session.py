@@ -138,7 +138,10 @@ class PublishError(InputError):
 
     def __init__(self, key: str, text: str, name: str = "") -> None:
         super().__init__(f"{name or f'publish.{key}'}: {text}")
-        self.key, self.text = key, text
+        self.key, self.text, self._name = key, text, name
+
+    def __reduce__(self) -> tuple[type[PublishError], tuple[str, str, str]]:
+        return PublishError, (self.key, self.text, self._name)  # what was wrong also reaches another process
 
 
 class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
