@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from gripmon.judge import drift, repeats, smoothing, stream
+from gripmon.judge import causes, drift, repeats, smoothing, stream
 from gripmon.model import poses
 from gripmon.model.compiled import FUNCTIONS, Kept, Watched, locked
 from gripmon.model.own_process import OwnProcess
@@ -30,7 +30,7 @@ PARTS: dict[str, tuple[Callable[[], object], ...]] = {
     "drift": (drift.warm_up,),
     "edge points": (edges.warm_up_profiles,),
     "geometry": (edges.warm_up_geometry,),
-    "averages": (smoothing.warm_up, stream.warm_up, repeats.warm_up, poses.warm_up, look.warm_up),
+    "averages": (smoothing.warm_up, stream.warm_up, repeats.warm_up, causes.warm_up, poses.warm_up, look.warm_up),
 }
 """What frames need, in parts that can be compiled at once, the longest first."""
 

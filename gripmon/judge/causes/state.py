@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW, beside_edges
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
 
-POSE, JAW, FOCAL, FINGERS = slice(0, 6), 6, 7, 8
-"""Places of the unknowns; finger f has the six from ``FINGERS + 6 f`` on: translation, then rotation about the middle
-of its points, camera axes."""
+POSE = slice(0, 6)
+"""Place of the camera's pose among the unknowns."""
 
 
 def finger_slice(finger: int) -> slice:
@@ -70,13 +70,11 @@ def points_cam(gripper: Gripper, state: State, at_opening: tuple[Array, Array]) 
     rotation = state.cam_T_grip[:3, :3]
     points = at_opening[0] @ rotation.T + state.cam_T_grip[:3, 3]
     rate = at_opening[1] @ rotation.T
-    middle = np.zeros((len(gripper.finger_ids), 3))
-    for finger, motion in enumerate(state.finger):
-        own = gripper.point_finger == finger
-        middle[finger] = points[own].mean(axis=0)
-        if motion.any():
-            lever = points[own] - middle[finger]
-            points[own] += lever @ (exp_rotation(motion[3:]) - np.eye(3)).T + motion[:3]
+    own = gripper.point_finger == np.arange(len(gripper.finger_ids))[:, None]
+    middle = own @ points / np.count_nonzero(own, axis=1)[:, None]
+    for finger in np.flatnonzero(state.finger.any(axis=1)).tolist():
+        motion, lever = state.finger[finger], points[own[finger]] - middle[finger]
+        points[own[finger]] += lever @ (exp_rotation(motion[3:]) - np.eye(3)).T + motion[:3]
     return points, rate, middle
 
 
@@ -97,6 +95,7 @@ class EdgeView:
         self._gripper, self._evidence = gripper, evidence
         self._start = gripper.edge_points[evidence.edge, 0]
         self._finger = gripper.edge_finger[evidence.edge]
+        self._per_px = np.ascontiguousarray(evidence.per_px)
         self._camera = camera
         self._uv_px = camera.distort(evidence.xy)
         self._centre_px = np.array([camera.cx_px, camera.cy_px])
@@ -108,39 +107,27 @@ class EdgeView:
         """(s,) measured minus predicted place of each stretch across its edge, px, and (s, m) the derivative of the
         predicted one by all unknowns.
         """
-        if self._opened is None or self._opened[0] != state.jaw_opening_m:
-            self._opened = state.jaw_opening_m, opened(self._gripper, state.jaw_opening_m)
-        points, rate, middle = points_cam(self._gripper, state, self._opened[1])
-        a, b = self._tangents(points, state)
-        xy, by_focal = self._ideal(state.log_focal)
-        line = _cross(a, b)
-        perp = _across(a, b)
-        size = np.einsum("si,si->s", line[:, :2], perp)
-        off = (np.einsum("si,si->s", line[:, :2], xy) + line[:, 2]) / size
-        per_px = self._evidence.per_px
-        spot = _on_edge(a, b, xy, np.column_stack([perp[:, 1], -perp[:, 0]]))
-        gradient = np.empty((len(xy), 3))
-        gradient[:, :2] = perp / spot[:, 2:]
-        gradient[:, 2] = -np.einsum("si,si->s", perp, spot[:, :2]) / spot[:, 2] ** 2
-        gradient /= per_px[:, None]
-        focal = np.einsum("si,si->s", perp, by_focal) / per_px
-        return off / per_px, self._jacobian(state, spot, gradient, rate, middle, focal)
+        return self._beside(state)[:2]
 
     def beside(self, state: State) -> tuple[Array, Array]:
         """(s,) measured minus predicted place of each stretch across its edge, px, and the fraction (s,) of the edge's
         image beside which it lies: :func:`edge_places` there, and so much across, is the measured place.
         """
-        residual, _ = self.residual(state)
-        points, _, _ = points_cam(self._gripper, state, opened(self._gripper, state.jaw_opening_m))
-        a, b = self._tangents(points, state)
-        perp = _across(a, b)
-        spot = _on_edge(a, b, self._ideal(state.log_focal)[0], np.column_stack([perp[:, 1], -perp[:, 0]]))
-        span = b - a
-        return residual, np.einsum("si,si->s", spot - a, span) / np.einsum("si,si->s", span, span)
+        residual, _, fraction = self._beside(state)
+        return residual, fraction
 
-    def _tangents(self, points: Array, state: State) -> tuple[Array, Array]:
-        evidence = self._evidence
-        return self._gripper.tangents_m(points, evidence.edge, evidence.fraction, state.cam_T_grip[:3, :3])
+    def _beside(self, state: State) -> tuple[Array, Array, Array]:
+        if self._opened is None or self._opened[0] != state.jaw_opening_m:
+            self._opened = state.jaw_opening_m, opened(self._gripper, state.jaw_opening_m)
+        points, rate, middle = points_cam(self._gripper, state, self._opened[1])
+        evidence, pose = self._evidence, state.cam_T_grip
+        a, b = self._gripper.tangents_m(points, evidence.edge, evidence.fraction, pose[:3, :3])
+        xy, by_focal = self._ideal(state.log_focal)
+        pivots = middle + state.finger[:, :3]
+        found: tuple[Array, Array, Array] = beside_edges(
+            a, b, xy, by_focal, self._per_px, rate[self._start], self._finger, pose[:3, 3].copy(), pivots
+        )
+        return found
 
     def _ideal(self, log_focal: float) -> tuple[Array, Array]:
         """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
@@ -153,44 +140,12 @@ class EdgeView:
         self._at = log_focal, (xy, np.einsum("sij,sj->si", d_xy, from_centre) * np.exp(-log_focal))
         return self._at[1]
 
-    def _jacobian(
-        self, state: State, spot: Array, gradient: Array, rate: Array, middle: Array, by_focal: Array
-    ) -> Array:
-        out = np.zeros((len(spot), FINGERS + state.finger.size))
-        out[:, :3] = gradient
-        out[:, 3:6] = _cross(spot - state.cam_T_grip[:3, 3], gradient)
-        out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._start])
-        out[:, FOCAL] = by_focal
-        about_middle = _cross(spot - middle[self._finger] - state.finger[self._finger, :3], gradient)
-        for finger in range(len(state.finger)):
-            own = (self._finger == finger)[:, None]
-            start = FINGERS + 6 * finger
-            out[:, start : start + 3] = own * gradient
-            out[:, start + 3 : start + 6] = own * about_middle
-        return out
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross products (s, 3), without NumPy's overhead."""
-    x, y, z = a.T
-    u, v, w = b.T
-    return np.column_stack([y * w - z * v, z * u - x * w, x * v - y * u])
-
 
 def _across(a: Array, b: Array) -> Array:
     """(s, 2) across the images of edges from a to b, ideal coordinates, along the search lines' direction."""
     along = b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:]
     along /= np.sqrt(np.einsum("si,si->s", along, along))[:, None]
     return np.column_stack([-along[:, 1], along[:, 0]])
-
-
-def _on_edge(a: Array, b: Array, xy: Array, along: Array) -> Array:
-    """Points (s, 3) of the edges from a to b that show beside the places ``xy``: equally far along the image line."""
-    span = b - a
-    at = np.einsum("si,si->s", along, xy)
-    above = at * a[:, 2] - np.einsum("si,si->s", along, a[:, :2])
-    below = np.einsum("si,si->s", along, span[:, :2]) - at * span[:, 2]
-    return a + (above / below)[:, None] * span
 
 
 def finger_lever_m(gripper: Gripper) -> Array:

@@ -87,8 +87,11 @@ class Evidence:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image."""
-        return not (self.believed or self.where_it_was or self.old)
+        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image, nor with a
+        fault of gripper or lens, which has an alert of its own.
+        """
+        faulty = self.explanation.confirmed_cause.cause in NOT_THE_CAMERA
+        return not (self.believed or self.where_it_was or self.old or faulty)
 
     @property
     def moved(self) -> bool:
@@ -149,7 +152,7 @@ class Policy:
         self.state = state
         beyond = past_alert_limit(evidence.protection, settings)
         reason = self._doubt(evidence, confirmed, beyond)
-        if not (_elsewhere(evidence) or (evidence.unproven and beyond is not None)):
+        if not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
             self._unproven_since = None
         elif self._unproven_since is None:
             self._unproven_since, self._unproven_text = (now_s, stamp_ns), ""
@@ -319,7 +322,7 @@ class Policy:
         if since is not None and now_s - since[0] >= self._settings.hold_s:
             # As long as a transform is held of which nothing is seen.
             if not self._unproven_text:
-                there = evidence.shift if _elsewhere(evidence) else None
+                there = evidence.shift if evidence.elsewhere else None
                 self._unproven_text = unproven_text(since[1], there, stamp_ns)
             text = self._unproven_text
             unproven = Alert(AlertKind.OCCLUDED, Cause.UNKNOWN, Severity.WARNING, text)
@@ -380,11 +383,6 @@ class Policy:
             rate_m_per_min=rate,
             time_left_s=left_s,
         )
-
-
-def _elsewhere(evidence: Evidence) -> bool:
-    """Whether it is to be told that the gripper is elsewhere: a fault of gripper or lens has an alert of its own."""
-    return evidence.elsewhere and evidence.explanation.confirmed_cause.cause not in NOT_THE_CAMERA
 
 
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:

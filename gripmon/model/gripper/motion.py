@@ -49,9 +49,10 @@ def offset_m(table: Array, opening_m: float) -> Array:
     """Offset (3,) of a finger in the gripper frame at an opening; beyond the table it goes on straight."""
     if len(table) == 1:
         return table[0, 1:]
-    k = min(max(int(table[:, 0].searchsorted(opening_m, "right")) - 1, 0), len(table) - 2)
-    way = (table[k + 1, 1:] - table[k, 1:]) / (table[k + 1, 0] - table[k, 0])
-    return np.asarray(table[k, 1:] + way * (opening_m - table[k, 0]))
+    last = len(table) - 2
+    k = min(max(int(table[:, 0].searchsorted(opening_m, "right")) - 1, 0), last) if last else 0
+    low, high = table[k], table[k + 1]
+    return np.asarray(low[1:] + (opening_m - low[0]) / (high[0] - low[0]) * (high[1:] - low[1:]))
 
 
 def beyond_table_m(table: Array, opening_m: float) -> float:
