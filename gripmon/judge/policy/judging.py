@@ -87,8 +87,8 @@ class Evidence:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image, nor with a
-        fault of gripper or lens, which has an alert of its own.
+        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image, nor with
+        a fault of gripper or lens, which has an alert of its own.
         """
         faulty = self.explanation.confirmed_cause.cause in NOT_THE_CAMERA
         return not (self.believed or self.where_it_was or self.old or faulty)
