@@ -15,9 +15,9 @@ from support.shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend,
 from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.judge.causes import CauseJudge, CauseSettings
-from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW
+from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW, POSE
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES, STUDENT_FREEDOM, Errors, Model, something_else, weigh
-from gripmon.judge.causes.state import POSE, EdgeView, State
+from gripmon.judge.causes.state import EdgeView, State
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Cause, EdgeEvidence

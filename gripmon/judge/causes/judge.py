@@ -16,10 +16,10 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
-from gripmon.judge.causes.kernel import FOCAL, JAW
+from gripmon.judge.causes.kernel import FOCAL, JAW, POSE
 from gripmon.judge.causes.models import MOST_FOREIGN_EDGES
 from gripmon.judge.causes.pooling import SEEN_EDGES, Baseline, Pooled, pool
-from gripmon.judge.causes.state import POSE, finger_slice
+from gripmon.judge.causes.state import finger_slice
 from gripmon.judge.causes.watches import BASELINE_FRAMES
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper

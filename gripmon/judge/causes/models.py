@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW
-from gripmon.judge.causes.state import POSE, EdgeView, State, finger_lever_m, finger_slice
+from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW, POSE
+from gripmon.judge.causes.state import EdgeView, State, finger_lever_m, finger_slice
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.causes.kernel import JAW
-from gripmon.judge.causes.state import POSE, EdgeView, State, edge_places
+from gripmon.judge.causes.kernel import JAW, POSE
+from gripmon.judge.causes.state import EdgeView, State, edge_places
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence

@@ -11,15 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW, beside_edges
+from gripmon.judge.causes.kernel import FINGERS, FOCAL, JAW, POSE, beside_edges
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
-
-POSE = slice(0, 6)
-"""Place of the camera's pose among the unknowns."""
-
 
 def finger_slice(finger: int) -> slice:
     return slice(FINGERS + 6 * finger, FINGERS + 6 * (finger + 1))
