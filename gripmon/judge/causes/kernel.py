@@ -13,8 +13,8 @@ import numpy as np
 from gripmon.model.compiled import compiled
 
 POSE, JAW, FOCAL, FINGERS = slice(0, 6), 6, 7, 8
-"""Places of the unknowns; finger f has the six from ``FINGERS + 6 f`` on: translation, then
-rotation about the middle of its points, camera axes."""
+"""Places of the unknowns; finger f has the six from ``FINGERS + 6 f`` on: translation, then rotation about the middle
+of its points, camera axes."""
 
 
 @compiled

@@ -17,6 +17,7 @@ from gripmon.model.geometry import exp_rotation, perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
 
+
 def finger_slice(finger: int) -> slice:
     return slice(FINGERS + 6 * finger, FINGERS + 6 * (finger + 1))
 
