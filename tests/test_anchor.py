@@ -11,9 +11,9 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
-from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
+from gripmon.monitor.bounds import SIGMA_INFLATION, bound_of
 from gripmon.monitor.since import AtReference, Opened
-from gripmon.track.integrity import Cases, Separation, bounds, hypotheses_of, with_known
+from gripmon.track.integrity import Separation, bounds, hypotheses_of, with_known
 from gripmon.track.integrity.kernel import telling
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
@@ -24,7 +24,6 @@ ALONG = np.array([True, True, False, False, True, True, False, False])
 INNER = np.array(["_in" in name for name in NAMES])
 EVERY = hypotheses_of(SAID, FINGER, FINGERS, ALONG, INNER, True)
 LASTING = Lasting.of(EVERY)
-NOTHING_COMMON = ModelError(0.0, np.zeros(3), np.zeros(0, dtype=np.intp), 2, common=None)
 ROWS = np.arange(len(LASTING.name))
 BASE_T = perturb(np.eye(4), np.array([0.01, -0.02, 0.2, 0.1, 0.2, -0.1]))
 STILL = np.zeros(6)
@@ -98,8 +97,7 @@ def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray
     own = frame.shifts(frame.cam_T_grip), frame.covariance, frame.of_model
     told = Separation(*telling(*average, at, way, *own, ROWS, CONTRADICTION_SQUARE))
     known = with_known(told, perturbation_between(frame.cam_T_grip, origin_T), origin + np.diag(way))
-    cases = Cases.of(LASTING.name, LASTING.priors(SURE), known)
-    return NOTHING_COMMON.absolute([cases], frame.cam_T_grip).levels(risk)[0]
+    return bound_of((*known, LASTING.priors(SURE), ROWS, ROWS), risk)[0]
 
 
 def error_m(frame: Frame, truth: np.ndarray = STILL) -> float:
@@ -297,7 +295,7 @@ def test_play_of_the_mount_is_in_what_a_motion_counts_from_once():
     averages = [average_of(BASE_T, [(frame, ROWS) for frame in each], play) for each in seen]
     at = AtReference(BASE_T, averages[0], 0.03, frames, Since.REFERENCE, 0, SURE, True, of_images=True)
     counts = at.differences(BASE_T, BASE_T, Opened(0.03, np.zeros(6)), None, np.square(play))
-    claimed = counts.begun.covariance[0].diagonal()
+    claimed = counts[0][1][0].diagonal()
     np.testing.assert_allclose(claimed, np.square([each.shift[0] for each in averages]).mean(axis=0), rtol=0.2)
 
 

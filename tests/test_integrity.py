@@ -7,9 +7,10 @@ import pytest
 from scipy import stats
 from support.by_numpy.integrity import beyond
 
-from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, bounds, hypotheses_of, kernel
+from gripmon.track.integrity import Hypotheses, Separation, bounds, hypotheses_of, kernel
+from gripmon.track.integrity.frame_kernel import absolute_level
 from gripmon.track.integrity.hypotheses import WRONG_EDGE, WRONG_GRIPPER
-from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails
+from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, Tails, limits_of
 
 # --- quantiles ---
 
@@ -193,20 +194,25 @@ def exact_model(count: int) -> np.ndarray:
     return np.zeros((count, 1, 6))
 
 
-def doubts_of(prior: list[float], away: list[float], sigma: list[float]) -> Doubts:
-    """Of hypotheses "0", "1", ... whose fits are ``away`` along x, with errors along x alone."""
+def level(fits: Separation, prior: np.ndarray, risk: float, inflation: float = 1.0) -> tuple[float, float, int]:
+    """Of position and rotation, and the number of the hypothesis that the position's owes most to."""
+    called, alike = np.arange(len(prior)), np.zeros((0, 6))
+    return absolute_level((*fits, prior, called, called), len(prior), alike, np.zeros(2), limits_of(risk, inflation))
+
+
+def level_along_x(prior: list[float], away: list[float], sigma: list[float], risk: float) -> tuple[float, float, int]:
+    """Of hypotheses whose fits are ``away`` along x, with errors along x alone."""
     shift, covariance = np.zeros((len(prior), 6)), np.zeros((len(prior), 6, 6))
     shift[:, 0], covariance[:, 0, 0] = away, np.square(sigma)
     covariance[:, range(3, 6), range(3, 6)] = 9.0
-    fits = Separation(shift, covariance, exact_model(len(prior)))
-    return Doubts((Cases.of(tuple(str(k) for k in range(len(prior))), np.array(prior), fits),), 1.0)
+    return level(Separation(shift, covariance, exact_model(len(prior))), np.array(prior), risk)
 
 
 def test_one_hypothesis_takes_all_of_the_risk():
-    position, rotation, name = doubts_of([0.02], [3.0], [2.0]).levels(1e-3)
+    position, rotation, number = level_along_x([0.02], [3.0], [2.0], 1e-3)
     assert position == pytest.approx(3.0 + 2.0 * stats.chi2.isf(0.05, 1) ** 0.5, rel=LEVEL_TOLERANCE_RATIO - 1.0 + 5e-3)
     assert rotation == pytest.approx(3.0 * stats.chi2.isf(0.05, 3) ** 0.5, rel=LEVEL_TOLERANCE_RATIO - 1.0 + 3e-3)
-    assert name == "0"
+    assert number == 0
 
 
 @pytest.mark.parametrize("risk", [1e-2, 1e-3, 1e-5, 1e-7])
@@ -214,27 +220,27 @@ def test_all_hypotheses_together_exceed_a_level_with_the_stated_risk(risk: float
     """By the normal distribution, each error along one line: the sum is the risk, or the level 2 % too long."""
     prior, away, sigma = [1.0, 1e-2, 1e-2, 1e-3], [0.0, 0.5, 0.1, 4.0], [0.2, 0.4, 1.0, 0.3]
     rows = list(zip(prior, away, sigma, strict=True))
-    level, _, name = doubts_of(prior, away, sigma).levels(risk)
+    level_m, _, number = level_along_x(prior, away, sigma, risk)
 
     def beyond(length: float) -> float:
         each = [p * 2.0 * stats.norm.sf((length - a) / s) if length > a else p for p, a, s in rows]
         return float(sum(each))
 
-    assert beyond(1.004 * level) <= risk * 1.02
-    assert beyond(level / LEVEL_TOLERANCE_RATIO / 1.004) >= risk * 0.98
-    owed = [p * stats.norm.sf((level - a) / s) for p, a, s in rows]
-    assert name == str(int(np.argmax(owed)))
+    assert beyond(1.004 * level_m) <= risk * 1.02
+    assert beyond(level_m / LEVEL_TOLERANCE_RATIO / 1.004) >= risk * 0.98
+    owed = [p * stats.norm.sf((level_m - a) / s) for p, a, s in rows]
+    assert number == int(np.argmax(owed))
 
 
 def test_what_is_improbable_takes_its_part_of_the_risk_and_bounds_nothing():
     """A hypothesis that leaves everything open, half as probable as the risk: the others have the other half."""
-    both, _, _ = doubts_of([1.0, 5e-6], [0.0, 0.0], [1.0, 1e4]).levels(1e-5)
+    both, _, _ = level_along_x([1.0, 5e-6], [0.0, 0.0], [1.0, 1e4], 1e-5)
     assert both == pytest.approx(stats.norm.isf(0.25e-5), rel=LEVEL_TOLERANCE_RATIO - 1.0 + 5e-3)
-    open_wide, _, name = doubts_of([1.0, 2e-5], [0.0, 0.0], [1.0, 1e4]).levels(1e-5)
-    assert open_wide > 5e3 and name == "1"
-    nothing = doubts_of([1e-7], [5.0], [1.0]).levels(1e-5)
-    assert nothing == (0.0, 0.0, "")
-    rare = doubts_of([1.0, 1e-7], [0.0, 5.0], [1.0, 1.0]).levels(1e-5)
+    open_wide, _, number = level_along_x([1.0, 2e-5], [0.0, 0.0], [1.0, 1e4], 1e-5)
+    assert open_wide > 5e3 and number == 1
+    nothing = level_along_x([1e-7], [5.0], [1.0], 1e-5)
+    assert nothing == (0.0, 0.0, -1)
+    rare = level_along_x([1.0, 1e-7], [0.0, 5.0], [1.0, 1.0], 1e-5)
     assert rare[0] < 4.6, "too improbable to be reckoned with"
 
 
@@ -244,16 +250,9 @@ def test_levels_take_position_and_rotation_alone():
     covariance[:, 0, 3] = covariance[:, 3, 0] = 1.0  # errors that belong together change neither part
     shift = np.array([[3.0, 0.0, 4.0, 0.0, -2.0, 0.0]])
     fits = Separation(shift, covariance, exact_model(1))
-    position, rotation, _ = Doubts((Cases.of(("one",), np.ones(1), fits),), 1.5).levels(1e-3)
+    position, rotation, _ = level(fits, np.ones(1), 1e-3, 1.5)
     assert position == pytest.approx(5.0 + 1.5 * 2.0 * stats.chi2.isf(1e-3, 1) ** 0.5, rel=0.025)
     assert rotation == pytest.approx(2.0 + 1.5 * 3.0 * stats.chi2.isf(1e-3, 3) ** 0.5, rel=0.025)
-
-
-def test_doubts_of_several_sets_are_those_of_one():
-    one, other = doubts_of([1.0, 0.1], [0.0, 2.0], [1.0, 1.0]), doubts_of([0.2], [9.0], [1.0])
-    at_once = doubts_of([1.0, 0.1, 0.2], [0.0, 2.0, 9.0], [1.0] * 3)
-    *both, name = Doubts((*one.sets, *other.sets), 1.0).levels(1e-3)
-    assert tuple(both) == at_once.levels(1e-3)[:2] and name == "0"  # the other's own
 
 
 # --- the promise ---
@@ -274,7 +273,7 @@ def of_two_fingers(has_opening: bool = False) -> Hypotheses:
 def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
     """The bound of the position: the first fit is published."""
     found = found._replace(shift=found.shift - found.shift[0])
-    return Doubts((Cases.of(hypotheses.name, hypotheses.prior, found),), 1.0).levels(risk)[0]
+    return level(found, hypotheses.prior, risk)[0]
 
 
 def exceeded(model: Model, hypotheses: Hypotheses, risk: float, trials: int, bias: np.ndarray, seed: int) -> float:

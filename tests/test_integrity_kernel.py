@@ -11,11 +11,11 @@ from support.by_numpy import integrity as by_numpy
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
-from gripmon.monitor import Monitor, weigher
+from gripmon.monitor import Monitor, bounds, refits, weigher
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.track.integrity import Cases, Doubts, Separation, frame_kernel, kernel, level_kernel, separation
-from gripmon.track.integrity.separation import QUANTILES, Tails
+from gripmon.track.integrity import Separation, frame_kernel, kernel, level_kernel, separation
+from gripmon.track.integrity.separation import Tails, limits_of
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
 HYPOTHESES, EDGES, FINGERS = 14, 8, 2
@@ -134,7 +134,9 @@ def tables(rng: np.random.Generator, kinds: int, staying: bool, odds: float | No
     which, alike, farther = rng.integers(0, HYPOTHESES, 9), of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])
     found = np.full((2, 7, 20), np.nan)
     for by, table in zip((level_kernel, by_numpy), found, strict=True):
-        by.doubted(*of, alike, farther, 1.2, 1e-2, table, 0)
+        doubted = np.full((7, 9), np.nan)
+        by.doubted(*of, alike, farther, 1.2, 1e-2, doubted)
+        table[:, :9] = doubted
         by.moved(*of, which, *begun, lever, *motion, known, *true, 1.2, 1e-2, table, 10)
     return found[0], found[1]
 
@@ -173,11 +175,6 @@ def test_jumps_are_those_of_numpy(seed: int):
         np.testing.assert_allclose(np.append(weight, left), np.append(expected, rest), rtol=1e-8)
 
 
-def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:
-    """Of the kernel."""
-    return level_kernel.levels(prior, away, *tails, risk, 1.02, *QUANTILES)
-
-
 @pytest.mark.parametrize("risk", [1e-1, 1e-3, 1e-5, 1e-9, 1e-13])
 @pytest.mark.parametrize("seed", range(5))
 def test_levels_are_those_of_numpy(seed: int, risk: float):
@@ -185,8 +182,8 @@ def test_levels_are_those_of_numpy(seed: int, risk: float):
     prior = 10.0 ** rng.uniform(-7.0, 0.0, HYPOTHESES)
     away, sigma, factor = by_numpy.tails(*fits(rng), 1.2)
     for priors in (prior, np.append(1.0, prior[1:]), 1e-3 * prior):
-        *found, number = levels_of(priors, away, Tails(sigma, factor), risk)
-        *expected, owed = by_numpy.levels(priors, away, sigma, factor, risk, 1.02)
+        of = np.vstack([priors, away, sigma, factor]), np.arange(HYPOTHESES), limits_of(risk, 1.0)
+        (*found, number), (*expected, owed) = level_kernel.levels(*of), by_numpy.levels(*of)
         np.testing.assert_allclose(found, expected, rtol=1e-9)
         assert number == owed
 
@@ -208,7 +205,7 @@ def test_tails_of_every_shape_are_those_of_numpy(variances: tuple[float, ...]):
         covariance = np.zeros((1, 6, 6))
         covariance[0, :3, :3] = covariance[0, 3:, 3:] = size * (axes * variances) @ axes.T
         fits, table = (np.zeros((1, 6)), covariance, np.zeros((1, 0, 6))), np.empty((7, 1))
-        Cases.of(("",), np.ones(1), Separation(*fits)).fill(table, 0, 0.0, 1.0)
+        level_kernel.doubted(*fits, np.ones(1), np.zeros((0, 6)), np.zeros(2), 1.0, 0.0, table)
         away, sigma, factor = table[1:3], table[3:5], table[5:7]
         expected = Tails(*by_numpy.tails(*fits, 1.0)[1:])
         assert not away.any()
@@ -330,7 +327,7 @@ def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatch
     assert counts == numbers and probable.any() and len(cases[3]) == len(probable)
     agree([each[probable] for each in cases], [each[probable] for each in expected])
     agree((spread, left), (knock, out))
-    limits = 1e-5 - left, 1.2, 1.02, *QUANTILES
+    limits = limits_of(1e-5 - left, 1.2)
     common, tilt = (of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])), 0.1 * rng.normal(size=(kinds, 6, 3))
     since = tuple(first), np.eye(6), tilt, shifts(rng, 1)[0], *(0.1 * rng.normal(size=(2, 3))), shifts(rng, 1)[0]
     for moves in (displaced, True):
@@ -349,9 +346,10 @@ KNOCKED_AT = 15  # frame
 def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[FrameRecord]:
     """Of the demo's camera over half a second, with a knock in the middle."""
     monkeypatch.setattr(separation, "kernel", by)
-    monkeypatch.setattr(separation, "level_kernel", level_kernel if by is kernel else by)
+    monkeypatch.setattr(refits, "refitted", by.refitted)
     for name in ("gathered", "absolute_level", "level_of_motion"):
         monkeypatch.setattr(weigher, name, getattr(frame_kernel if by is kernel else by, name))
+    monkeypatch.setattr(bounds, "absolute_level", weigher.absolute_level)
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))
@@ -378,7 +376,8 @@ def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, se
         assert np.abs((mine - known) / np.outer(sigma, sigma)).max() < near
 
 
-def test_doubts_of_none_bound_nothing():
-    none = Separation(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 0, 6)))
-    assert Doubts((Cases.of((), np.zeros(0), none),), 1.0).levels(1e-5) == (0.0, 0.0, "")
-    assert Doubts((), 1.0).levels(1e-5) == (0.0, 0.0, "")
+def test_no_cases_bound_nothing():
+    number = np.zeros(0, np.intp)
+    none = np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 0, 6)), np.zeros(0), number, number
+    bound = frame_kernel.absolute_level(none, 0, np.zeros((0, 6)), np.zeros(2), limits_of(1e-5, 1.0))
+    assert bound == (0.0, 0.0, -1)

@@ -49,7 +49,9 @@ from gripmon.simulate.scenario import (
     Vibration,
 )
 from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.integrity import Cases, Separation
+from gripmon.track.integrity import Separation
+from gripmon.track.integrity.level_kernel import doubted
+from gripmon.track.integrity.level_kernel import moved as moved_since
 
 BY_REFERENCE = PolicySettings(valid_by=ValidBy.REFERENCE)
 FPS, KNOCK_M = 20.0, (0.002, 0.0, 0.002)
@@ -188,15 +190,14 @@ def test_its_covariance_and_its_differences_are_those_of_the_published_pose():
     # The same of fits under hypotheses: a shift of x, and one of b.
     of_x, of_b = 1e-4 * rng.normal(size=(2, 6)), 1e-4 * rng.normal(size=(3, 6))
     at = at._replace(fits=at.fits._replace(shift=of_b))
-    fits = Separation(of_x, np.tile(root @ root.T, (2, 1, 1)), np.zeros((2, 1, 6)))
-    which, name = np.array([0, 2]), ("", "")
-    made = at.differences(x_T, reference_T, Opened(0.03, none), None, none).of(Cases.of(name, np.ones(2), fits), which)
+    which, prior, exact, unknown = np.array([0, 2]), np.ones(2), np.zeros((2, 1, 6)), np.zeros((0, 6))
+    begun, *first = at.differences(x_T, reference_T, Opened(0.03, none), None, none)
+    table, same = np.empty((2, 7, 2))
+    fits = of_x, np.tile(root @ root.T, (2, 1, 1)), exact, prior
+    moved_since(*fits, which, *begun, *first, unknown, unknown, np.zeros((6, 6)), 0.0, 1.0, 0.0, table, 0)
     ways = of_x @ jacobian[0].T + of_b[which] @ jacobian[1].T
-    same = Cases.of(name, np.ones(2), Separation(ways, np.tile(expected, (2, 1, 1)), np.zeros((2, 1, 6))))
-    tables = np.empty((2, 7, 2))
-    for sets, table in zip((made, same), tables, strict=True):
-        sets.fill(table, 0, 0.0, 1.0)
-    np.testing.assert_allclose(tables[0], tables[1], rtol=1e-4)
+    doubted(ways, np.tile(expected, (2, 1, 1)), exact, prior, unknown, np.zeros(2), 1.0, 0.0, same)
+    np.testing.assert_allclose(table, same, rtol=1e-4)
 
 
 def test_a_wrong_scale_counts_by_the_motion_and_the_jaws_travel():
@@ -212,8 +213,10 @@ def test_a_wrong_scale_counts_by_the_motion_and_the_jaws_travel():
     at, rate = at_reference(reference_T), rng.normal(size=6)
 
     def of_scale(opening_m: float) -> np.ndarray:
-        made = at.differences(x_T, reference_T, Opened(opening_m, rate), common, np.zeros(6))
-        return made.by_motion[0] @ made.moved + made.travel
+        _, _, by_motion, travel, origin, *_ = at.differences(
+            x_T, reference_T, Opened(opening_m, rate), common, np.zeros(6)
+        )
+        return by_motion[0] @ origin + travel
 
     np.testing.assert_allclose(-of_scale(0.03), way, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(of_scale(0.05) - of_scale(0.03), s * 0.02 * rate, rtol=1e-9, atol=1e-12)

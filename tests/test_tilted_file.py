@@ -25,7 +25,9 @@ from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, pla
 from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, gripper_digest, own_covariance
-from gripmon.track.integrity import Cases, Doubts, Moved, Separation
+from gripmon.track.integrity.level_kernel import levels
+from gripmon.track.integrity.level_kernel import moved as moved_since
+from gripmon.track.integrity.separation import limits_of
 
 FILE_T = nominal_cam_T_grip(np.degrees(USUAL_TILT_RAD))
 SIDES = {"left": (-0.025, -0.013), "right": (0.013, 0.025)}
@@ -354,9 +356,15 @@ def beyond(way: str, odds: float, risk: float, count: int = 1500) -> tuple[float
     by_motion[1, (2, 3, 4, 5), (0, 1, 0, 2)] = 0.26 * np.array([1.6, 10.0, 7.5, 2.5])
     by_motion[2, (2, 3, 4, 5), (1, 0, 1, 1)] = 0.26 * np.array([1.2, 5.0, 5.0, 2.5])
     at_origin = np.hstack([np.eye(3), skew(tcp)])
-    none, first = np.zeros((1, 0, 6)), np.zeros(1, dtype=np.intp)
-    exact = Separation(np.zeros((1, 6)), 1e-16 * np.eye(6)[None], none)
-    cases = Cases.of(("nothing is wrong",), np.ones(1), Separation(np.zeros((1, 6)), noise[None], none))
+    none, off, first, still = np.zeros((0, 6)), np.zeros((1, 0, 6)), np.zeros(1, dtype=np.intp), np.zeros((1, 6))
+    # What the true motion is known by besides the fits: nothing, or as of a mount that stays, or was knocked by these
+    # odds.
+    by_fits, stays, or_knocked = (none, knock, 0.0), (usual, knock, 0.0), (usual, knock, odds)
+    parts = {
+        "by what fits show": (by_fits,),
+        "as of a mount that stays": (stays,),
+        "by the true motion": (stays, or_knocked),
+    }[way]
     found = []
     for _ in range(count):
         knocked = rng.uniform() < odds
@@ -364,15 +372,12 @@ def beyond(way: str, odds: float, risk: float, count: int = 1500) -> tuple[float
         wrong = np.einsum("kij,k->ij", by_motion, rng.normal(size=3)) @ at_origin @ motion
         error = wrong + rng.multivariate_normal(np.zeros(6), noise)
         seen = motion + error
-        of = np.eye(6), by_motion, np.zeros(6), at_origin @ seen, tcp, -seen, np.zeros((0, 6))
-        by_fits = Moved(cases.prior, cases, first, exact, *of)
-        stayed = by_fits._replace(usual=usual)
-        sets = {
-            "by what fits show": (by_fits,),
-            "as of a mount that stays": (stayed,),
-            "by the true motion": (stayed, stayed._replace(knock=knock, odds=odds)),
-        }
-        position_m, rotation_rad, _ = Doubts(sets[way], 1.0).levels(risk)
+        of = still, noise[None], off, np.ones(1), first, still, 1e-16 * np.eye(6)[None], off
+        since = np.eye(6), by_motion, np.zeros(6), at_origin @ seen, tcp, -seen, none
+        table = np.empty((7, len(parts)))
+        for k, true in enumerate(parts):
+            moved_since(*of, *since, *true, 1.0, risk / len(parts), table, k)
+        position_m, rotation_rad, _ = levels(table, np.arange(len(parts)), limits_of(risk, 1.0))
         within = np.linalg.norm(error[:3]) <= position_m and np.linalg.norm(error[3:]) <= rotation_rad
         found.append((not within, knocked, position_m))
     out, is_knocked, bound_m = np.array(found).T

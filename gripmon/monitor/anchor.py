@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.bounds import SIGMA_INFLATION, protection_of
+from gripmon.monitor.bounds import bound_of, protection_of
 from gripmon.monitor.refits import Refits
 from gripmon.monitor.since import FIRST_FRAMES
-from gripmon.track.integrity import Cases, Doubts, Hypotheses, Separation, follow, with_known
+from gripmon.track.integrity import Hypotheses, Separation, follow, with_known
 from gripmon.track.integrity.frame_kernel import Fits
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
@@ -197,9 +197,9 @@ class Anchor:
 
     def bound(self, risk: float) -> Protection:
         """The protection level of the average itself."""
-        fits = self._with_origin(self.fits(), self.cam_T_grip)
-        cases = Cases.of(self._lasting.name, self._lasting.priors(self.misread), fits)
-        return protection_of(Doubts((cases,), SIGMA_INFLATION).levels(risk), risk)
+        fits, every = self._with_origin(self.fits(), self.cam_T_grip), np.arange(len(self._lasting.name))
+        cases = *fits, self._lasting.priors(self.misread), every, every
+        return protection_of(bound_of(cases, risk), self._lasting.name, risk)
 
     def _with_origin(self, fits: Separation, at_T: Array) -> Separation:
         """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +9,10 @@ from numpy.typing import NDArray
 
 from gripmon.model.records import Array, Protection
 from gripmon.monitor.common import CommonError
-from gripmon.monitor.since import AtReference, Bounds, Differences, Opened
-from gripmon.track.integrity import Cases, Doubts, Separation
+from gripmon.monitor.since import AtReference, Bounds, Opened
+from gripmon.track.integrity.frame_kernel import Cases, First, absolute_level
+from gripmon.track.integrity.level_kernel import Bound
+from gripmon.track.integrity.separation import limits_of
 
 SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
@@ -38,7 +39,7 @@ class ModelError(NamedTuple):
         """Number of the gripper's parts that may be off: its fingers, and its edges each by itself."""
         return self.fingers + len(self.finger)
 
-    def differences(self, cam_T_grip: Array, opened: Opened, swing: Array) -> Differences | None:
+    def differences(self, cam_T_grip: Array, opened: Opened, swing: Array) -> First | None:
         """What makes fits near a pose (4, 4) fits of the motion since the reference; None while nothing was measured
         there.  ``swing`` (6,): variances of the mount's vibration.
         """
@@ -50,16 +51,17 @@ class ModelError(NamedTuple):
         common = self.common
         return (np.zeros((0, 6)), np.zeros(2)) if common is None else (common.alike(cam_T_grip), common.farther)
 
-    def absolute(self, sets: Iterable[Cases], cam_T_grip: Array) -> Doubts:
-        """The doubts about a pose (4, 4), with what is common to all of them."""
-        alike, farther = self.alike(cam_T_grip)
-        return Doubts(tuple(each._replace(alike=alike, farther=farther) for each in sets), SIGMA_INFLATION)
+
+def bound_of(cases: Cases, risk: float, alike: tuple[Array, Array] | None = None) -> Bound:
+    """The bound by cases, and by what they are off by ``alike`` if :meth:`ModelError.alike` has something."""
+    alike_sigma, farther = alike or (np.zeros((0, 6)), np.zeros(2))
+    return absolute_level(cases, len(cases[3]), alike_sigma, farther, limits_of(risk, SIGMA_INFLATION))
 
 
-def as_uncertain_again(cases: Cases) -> Cases:
-    """Of the motion since the reference, while this frame is the first one."""
-    shift, covariance, _ = cases.fits
-    return cases._replace(fits=Separation(shift, 2.0 * covariance, np.zeros((len(shift), 0, 6))))
+def first_bound_of(cases: Cases, risk: float, rows: NDArray[np.intp] | slice = slice(None)) -> Bound:
+    """Of the motion since the reference, by some cases, while this frame is the first one: its errors count twice."""
+    shift, covariance, off, prior, called, which = cases
+    return bound_of((shift[rows], 2.0 * covariance[rows], off[rows][:, :0], prior[rows], called[rows], which), risk)
 
 
 def unbounded(risk: float, why: str) -> Bounds:
@@ -68,10 +70,11 @@ def unbounded(risk: float, why: str) -> Bounds:
     return Bounds(none, none)
 
 
-def protection_of(levels: tuple[float, float, str], risk: float) -> Protection:
+def protection_of(bound: Bound, names: tuple[str, ...], risk: float) -> Protection:
     """The protection levels, m and rad, at an integrity ``risk``, with the name of what the position's owes most to."""
-    position_m, rotation_rad, hypothesis = levels
-    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, hypothesis)
+    position_m, rotation_rad, number = bound
+    why = names[number] if number >= 0 else ""
+    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, why)
 
 
 def reaching(bound: Protection, away: Array, hypothesis: str) -> Protection:

@@ -14,11 +14,11 @@ from gripmon.model.poses import perturb
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Frame, ReferenceRecord, Since
 from gripmon.monitor.anchor import Lasting, average_of
 from gripmon.monitor.bounds import (
-    SIGMA_INFLATION,
     UNBOUNDED_M,
     UNBOUNDED_RAD,
     ModelError,
-    as_uncertain_again,
+    bound_of,
+    first_bound_of,
     protection_of,
     unbounded,
 )
@@ -30,7 +30,7 @@ from gripmon.monitor.since import AtReference, Bounds, digest_of
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import Measurement, inner_edges, sides
 from gripmon.track.edges.words import in_words
-from gripmon.track.integrity import Doubts, Hypotheses, hypotheses_of
+from gripmon.track.integrity import Hypotheses, hypotheses_of
 
 MOST_KEPT = 64
 """Sets of seen edges whose hypotheses are remembered."""
@@ -155,7 +155,7 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     hypotheses = possible.hypotheses(measurement.normal.edge)
     known, floor = _nothing_known(cam_T_grip), tracker.floor_of(measurement)
     fits = Refits(measurement, hypotheses, floor, possible.model, known)
-    cases = fits.cases(fits.away(cam_T_grip), hypotheses.prior, ~hypotheses.sudden)
-    absolute, risk = possible.model.absolute([cases], cam_T_grip), settings.policy.integrity_risk
-    since = Doubts((as_uncertain_again(cases),), SIGMA_INFLATION)
-    return Bounds(protection_of(absolute.levels(risk), risk), protection_of(since.levels(risk), risk))
+    cases = fits.cases(cam_T_grip, np.flatnonzero(~hypotheses.sudden))
+    risk = settings.policy.integrity_risk
+    both = bound_of(cases, risk, possible.model.alike(cam_T_grip)), first_bound_of(cases, risk)
+    return Bounds(*(protection_of(each, hypotheses.name, risk) for each in both))

@@ -14,8 +14,9 @@ from gripmon.model.records import Array
 from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
 from gripmon.monitor.since import Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
-from gripmon.track.integrity import Cases, Hypotheses, Separation, refitted
-from gripmon.track.integrity.frame_kernel import Doubted, Fits, Frame
+from gripmon.track.integrity import Hypotheses
+from gripmon.track.integrity.frame_kernel import Cases, Fits, Frame
+from gripmon.track.integrity.kernel import refitted
 
 
 @cache
@@ -35,7 +36,7 @@ class Anchored(NamedTuple):
     each fit without it.
     """
 
-    fits: Separation
+    fits: Fits
     square: Array
 
 
@@ -72,36 +73,31 @@ class Refits:
             fitted_m = prediction.jaw_opening_m + float(xi[6])
             opening = measurement.jaw_known_m - fitted_m, measurement.jaw_known_sigma_m
         before = known.covariance + floor, known.of_model
-        made = refitted(
-            (prediction.cam_T_grip, xi),
-            (normal.pull, normal.information, normal.middle, normal.lasting, normal.edge),
-            (model.finger, model.fingers, model.sigma_m * model.axis_grip),
-            (hypotheses.keep, hypotheses.opening, _vague(m)),
-            opening,
-            (known.anchor_T, *before),
-            SIGMA_INFLATION**2,
-            together,
-        )
-        self._fit_T, self._free = made.fit_T, made.alone
-        self.before: Fits = made.at, *before
+        fit_T, at, alone, anchored, square = refitted(
+            prediction.cam_T_grip, xi, normal.pull, normal.information, normal.middle, normal.lasting, normal.edge,
+            model.finger, model.fingers, model.sigma_m * model.axis_grip, hypotheses.keep, hypotheses.opening,
+            _vague(m), *opening, known.anchor_T, *before, SIGMA_INFLATION**2, together,
+        )  # fmt: skip
+        self.edges: NDArray[np.intp] = normal.edge
+        """(v,) edges that the fits are made of."""
+        self.before: Fits = at, *before
         """The pose that is known, from the fits' (6,), its covariance (6, 6), and its errors by the model."""
         # The free fit's distance from what is known, in units of both covariances.
-        self.anchored = Anchored(made.anchored, made.square)
-        self.stays: NDArray[np.bool_] = made.square <= CONTRADICTION_SQUARE
+        self.anchored = Anchored(anchored, square)
+        self.stays: NDArray[np.bool_] = square <= CONTRADICTION_SQUARE
         """(h,) under which hypotheses the pose may be where it is known to have been."""
-        self.covariance: Array = made.alone.covariance + floor
-        """(h, 6, 6) of the fits by the frame alone, without the model's error."""
-        self.of_model = made.alone.of_model
+        self.alone: Fits = alone
+        """The fits by the frame alone, of their own errors."""
+        self.covariance: Array = alone[1] + floor
+        """(h, 6, 6) of these, without the model's error."""
+        self.of_model: Array = alone[2]
         """(h, f, 6) their errors if a finger is longer by its standard deviation."""
+        self.frame: Frame = fit_T, alone, anchored, self.covariance, floor
+        """As :func:`~gripmon.track.integrity.frame_kernel.gathered` asks for."""
 
     def under(self, hypotheses: Hypotheses) -> Refits:
         """The fits by the frame alone under other hypotheses."""
         return Refits(self._measurement, hypotheses, self._floor, self.model, self.known, together=False)
-
-    @property
-    def edges(self) -> NDArray[np.intp]:
-        """(v,) edges that the fits are made of."""
-        return self._measurement.normal.edge
 
     @property
     def opened(self) -> Opened:
@@ -110,35 +106,15 @@ class Refits:
 
     def shifts(self, base_T: Array) -> Array:
         """(h, 6) perturbations from a pose (4, 4) near by to the fits by the frame alone."""
-        return perturbation_between(base_T, self._fit_T) + self._free.shift
+        return perturbation_between(base_T, self.frame[0]) + self.alone[0]
 
-    def away(self, cam_T_grip: Array) -> Array:
-        """(6,) where a published pose (4, 4) is from the one that the fits count from."""
-        return perturbation_between(self._fit_T, cam_T_grip)
-
-    def cases(self, away: Array, prior: Array, chosen: NDArray[np.bool_]) -> Cases:
-        """What may be wrong with a published pose, :meth:`away`, under the ``chosen`` hypotheses (h,) of probability
-        ``prior`` (h,), by the frame alone.
-        """
-        rows, shift = chosen.nonzero()[0], self._free.shift - away
-        fits = Separation(shift[rows], self.covariance[rows], self.of_model[rows])
-        return Cases(prior[rows], self.hypotheses.name, rows, fits)
-
-    @property
-    def alone(self) -> Fits:
-        """The fits by the frame alone, of their own errors."""
-        return tuple(self._free)
-
-    @property
-    def frame(self) -> Frame:
-        """As :func:`~gripmon.track.integrity.frame_kernel.gathered` asks for."""
-        return self._fit_T, self.alone, tuple(self.anchored.fits), self.covariance, self._floor
-
-    def doubted(self, prior: Array) -> Doubted:
-        """Likewise, of a ``prior`` (h,)."""
-        return prior, self.stays, self.hypotheses.endless
+    def cases(self, cam_T_grip: Array, rows: NDArray[np.intp]) -> Cases:
+        """What may be wrong with a published pose (4, 4) under the hypotheses ``rows`` (r,), by the frame alone."""
+        shift = self.alone[0] - perturbation_between(self.frame[0], cam_T_grip)
+        of_each = shift[rows], self.covariance[rows], self.of_model[rows], self.hypotheses.prior[rows]
+        return *of_each, rows, np.zeros_like(rows)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
-        pose = perturb(self._fit_T, anchored.fits.shift[number])
-        return pose, anchored.fits.covariance[number] + self._floor
+        shift, covariance, _ = anchored.fits
+        return perturb(self.frame[0], shift[number]), covariance[number] + self._floor

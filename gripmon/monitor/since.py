@@ -21,7 +21,6 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import SIZE_UNKNOWN
@@ -38,8 +37,8 @@ from gripmon.model.records import (
 )
 from gripmon.monitor.common import CommonError
 from gripmon.track.edges import Measurement
-from gripmon.track.integrity import Cases, Moved, Separation
-from gripmon.track.integrity.frame_kernel import begun, motion_since
+from gripmon.track.integrity import Separation
+from gripmon.track.integrity.frame_kernel import First, begun, motion_since
 
 FIRST_FRAMES = 30
 """Proved frames that b is the average of: in two seconds at 15 frames/s a mount creeps by 0.014 mm at the default rate,
@@ -113,30 +112,6 @@ class Average(Protocol):
 
     def bound(self, risk: float) -> Protection:
         """The protection level of the average itself."""
-
-
-class Differences(NamedTuple):
-    """What makes fits of a pose fits of exp(d) reference, as differences from the published ones: what g fits at the
-    reference take from that, ``begun``, the Jacobian ``lever`` (6, 6), and the pose of a mount that hasn't moved (6,).
-    The errors by the model that all have besides: of the jaws' ``travel`` (6,), and ``by_motion`` (k, 6, 3) times the
-    motion of the camera's origin, which is ``moved`` (3,) as published, of the TCP ``at`` (3,).
-    """
-
-    begun: Separation
-    lever: Array
-    by_motion: Array
-    travel: Array
-    moved: Array
-    at: Array
-    unmoved: Array
-
-    def of(self, cases: Cases, lasting: NDArray[np.intp] | None = None, staying: Array | None = None) -> Moved:
-        """The cases, of the motion.  ``lasting`` (r,): under which of the lasting hypotheses b is taken for each; None:
-        nothing was wrong then.  ``staying`` (6, 6): covariance of the motion that a mount makes, where the fits don't
-        contain that.
-        """
-        which = np.zeros(len(cases.prior), dtype=np.intp) if lasting is None else lasting
-        return Moved(cases.prior, cases, which, *self, np.zeros((0, 6)) if staying is None else staying)
 
 
 class AtReference(NamedTuple):
@@ -214,9 +189,9 @@ class AtReference(NamedTuple):
 
     def differences(
         self, cam_T_grip: Array, reference_T: Array, opened: Opened, common: CommonError | None, swing: Array
-    ) -> Differences:
-        """How fits near a published pose (4, 4) differ from that of exp(d) reference; ``swing`` (6,): variances by
-        which a mount that vibrates differs from its average.
+    ) -> First:
+        """What makes fits near a published pose (4, 4) fits of exp(d) reference; ``swing`` (6,): variances by which a
+        mount that vibrates differs from its average.
         """
         # That each image was at another place is in their average.
         more, travel = np.zeros((6, 6)) if self.of_images else np.diag(swing), np.zeros(6)
@@ -230,7 +205,7 @@ class AtReference(NamedTuple):
             size = common.scale_sigma if common.scale_sigma < SIZE_UNKNOWN else 0.0
             travel = size * travel_m * (lever @ opened.pose_rate)
             by_motion = np.concatenate([-size * np.eye(6, 3)[None], lever @ common.tilt.of_motion])
-        return Differences(Separation(*first), lever, by_motion, travel, moved, at, unmoved)
+        return first, lever, by_motion, travel, moved, at, unmoved
 
 
 def digest_of(measured_as: tuple[object, ...]) -> str:

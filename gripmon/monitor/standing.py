@@ -16,17 +16,19 @@ class Trust:
     """How far one measurement can be trusted.
 
     ``bounds``: of the pose in question.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
-    ``displaced``: the pose is not where the anchor has it.  ``ambiguous``: something other than a knock of the mount
-    may explain that; ``grasped``: an object between the fingers may.  ``may_have_slid``: a lone finger may have moved
-    along itself unnoticed.  ``most_probable``: the fits with the anchor, and the number of the most probable
-    hypothesis; None where all are excluded.  ``ends``: as they were seen.  ``fits``: those behind the bound, without
-    the ends where they aren't needed; None where no edge is seen.  ``misread``: probability that what looks like the
-    fingers' ends is something else.
+    ``displaced``: the pose is not where the anchor has it; ``knock`` (6, 6): covariance of the motion by a knock, None
+    where no edge is seen.  ``ambiguous``: something other than a knock of the mount may explain that; ``grasped``: an
+    object between the fingers may.  ``may_have_slid``: a lone finger may have moved along itself unnoticed.
+    ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis; None where all are
+    excluded.  ``ends``: as they were seen.  ``fits``: those behind the bound, without the ends where they aren't
+    needed; None where no edge is seen.  ``misread``: probability that what looks like the fingers' ends is something
+    else.
     """
 
     bounds: Bounds
     proven: bool
     displaced: bool = False
+    knock: Array | None = None
     ambiguous: bool = False
     grasped: bool = False
     may_have_slid: bool = False

@@ -19,7 +19,7 @@ from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
 from gripmon.monitor.anchor import Anchor
-from gripmon.monitor.bounds import SIGMA_INFLATION, as_uncertain_again, larger, protection_of, reaching, unbounded
+from gripmon.monitor.bounds import SIGMA_INFLATION, bound_of, first_bound_of, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits, in_the_references_frames
@@ -29,11 +29,11 @@ from gripmon.monitor.standing import Question, Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
-from gripmon.track.integrity import Cases, Doubts, Knocks, Mount, Separation, bounds
-from gripmon.track.integrity.frame_kernel import Bound, absolute_level, gathered, level_of_motion
+from gripmon.track.integrity import Mount, bounds
+from gripmon.track.integrity.frame_kernel import Fits, absolute_level, gathered, level_of_motion
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
-from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY, least_known
-from gripmon.track.integrity.separation import LEVEL_TOLERANCE_RATIO, QUANTILES
+from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY
+from gripmon.track.integrity.separation import limits_of
 from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
@@ -178,7 +178,7 @@ class Weigher:
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         besides = odds[1] * prior[hypotheses.ends]
         without = self._without_ends(fits, besides, displaced)
-        both = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
+        both, knock = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = without if without is not None and not proven and (displaced or not self.proved) else fits
@@ -186,7 +186,8 @@ class Weigher:
             proven, made_of = True, without
         # What was taken for the ends when the strips were learnt looks right ever after.
         misread = min(misread, misread * since_learnt + self._along_misread)
-        trust = Trust(both, proven, displaced, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
+        at = both, proven, displaced, knock
+        trust = Trust(*at, may_have_slid=may_have_slid, ends=ends, fits=made_of, misread=misread)
         if anchor is None:
             return trust
         along_unseen = besides * self._along_share > risk
@@ -257,21 +258,23 @@ class Weigher:
         cam_T_grip: Array,
         displaced: bool,
         now_s: float,
-    ) -> Bounds:
+    ) -> tuple[Bounds, Array]:
         """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
         is as known, and after the knocks that the mount may have got since, by the fits and by those ``without`` ends,
         with what may have been wrong all along, or in the reference's frames alone.  ``prior`` (h,): of the
-        hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.
+        hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.  And how far a knock moves
+        the mount, (6, 6).
         """
         anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
-        doubts, ends, risk = fits.doubted(prior), fits.hypotheses.ends, self._policy.integrity_risk
-        none, names, solved = tuple(each[:0] for each in fits.alone), fits.hypotheses.name, prior
-        bare = none, (prior[:0], doubts[1][:0], doubts[2][:0])
+        every, (shift, covariance, of_model), risk = fits.hypotheses, fits.alone, self._policy.integrity_risk
+        stays, endless, ends, names, solved = fits.stays, every.endless, every.ends, every.name, prior
+        none: Fits = shift[:0], covariance[:0], of_model[:0]
+        bare = none, (prior[:0], stays[:0], endless[:0])
         if without is fits:  # then that of the ends is the same as that nothing is wrong
             solved = prior * (np.arange(len(prior)) != ends)
         elif without is not None:
             of, names = without.hypotheses, names + without.hypotheses.name
-            bare = without.alone, without.doubted(prior[ends] * of.prior * of.more_than_ends)
+            bare = without.alone, (prior[ends] * of.prior * of.more_than_ends, without.stays, of.endless)
         names += lasting.name + in_the_references_frames(lasting.name)
         rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
         at_first = prior[:0] if first is None else lasting.priors(first.misread)
@@ -279,35 +282,24 @@ class Weigher:
         if anchor is not None and not displaced:
             always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
         knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
-        cases, counts, spread, left_out = gathered(
-            cam_T_grip, displaced, fits.frame, doubts, solved, bare, fits.before, knocks, always, at_first, risk,
-            self._least, SIGMA_INFLATION**2,
+        cases, counts, knock, left_out = gathered(
+            cam_T_grip, displaced, fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always,
+            at_first, risk, self._least, SIGMA_INFLATION**2,
         )  # fmt: skip
         if left_out > 0.5 * risk:
-            return unbounded(risk, "too much may be wrong at once")
-        limits = risk - left_out, SIGMA_INFLATION, LEVEL_TOLERANCE_RATIO, *QUANTILES
+            return unbounded(risk, "too much may be wrong at once"), knock
+        limits = limits_of(risk - left_out, SIGMA_INFLATION)
         absolute = absolute_level(cases, counts[2], *fits.model.alike(cam_T_grip), limits)
         differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
         if first is None or differences is None:  # this frame is the first one
             rows = np.append(np.arange(counts[1]), np.arange(counts[2], len(cases[3])))
-            shift, covariance, off, prior, called, _ = cases
-            fits_there = Separation(shift[rows], covariance[rows], off[rows])
-            again = Cases(prior[rows], names, called[rows], fits_there)
-            since = Doubts((as_uncertain_again(again),), SIGMA_INFLATION).levels(risk - left_out)
+            since = first_bound_of(cases, limits[0], rows)
         else:
             unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
             moves, unwatched = displaced or first.knocked, KNOCK_UNSEEN_PROBABILITY if first.of_images else 0.0
-            mount, begun = (self._usual_motion, moves, unwatched, unnoticed), tuple(differences.begun)
-            of_motion = level_of_motion(cases, counts, spread, (begun, *differences[1:]), mount, limits)
-            since = _named(of_motion, names)
-        return Bounds(protection_of(_named(absolute, names), risk), protection_of(since, risk))
-
-    def _knocks(self, fits: Refits, cam_T_grip: Array) -> Knocks:
-        """The knocks that a mount may get: some go along the fingers, the way that their sides don't show.  Tapered
-        ones have one of their own beside that of the fingers; fingers without a direction have none.
-        """
-        axis = cam_T_grip[:3, :3] @ self._axis
-        return Knocks.of(least_known(fits.covariance[fits.hypotheses.ends], axis, PARALLEL_COSINE))
+            mount = self._usual_motion, moves, unwatched, unnoticed
+            since = level_of_motion(cases, counts, knock, differences, mount, limits)
+        return Bounds(protection_of(absolute, names, risk), protection_of(since, names, risk)), knock
 
     @property
     def _usual_motion(self) -> Array:
@@ -342,7 +334,7 @@ class Weigher:
         """Add a pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it.  One that isn't
         proven counts until another one is, by its fits without the fingers' ends.
         """
-        assert trust.fits is not None
+        assert trust.fits is not None and trust.knock is not None
         proven = trust.proven
         if self.proved and not proven:
             return
@@ -360,7 +352,7 @@ class Weigher:
         if self.anchor is None or trust.displaced or proven > self.anchor.proven:
             origin_T, known = self.expected if self.proved else self._expected
             if trust.displaced:
-                known = known + self._knocks(trust.fits, cam_T_grip).spread
+                known = known + trust.knock
             misread = trust.misread
             beside_px = measurement.prediction.moved_px(perturbation_between(origin_T, cam_T_grip))
             if self.proved and beside_px < ONE_EDGE_PX:
@@ -421,14 +413,16 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        cases = fits.cases(fits.away(cam_T_grip), fits.hypotheses.prior, np.ones(len(fits.stays), dtype=np.bool_))
+        risk, count = self._policy.integrity_risk, len(fits.stays)
+        cases = fits.cases(cam_T_grip, np.arange(count))
         if self._policy.valid_by is ValidBy.ABSOLUTE:
-            doubts = fits.model.absolute([cases], cam_T_grip)
-        else:
-            found = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
-            doubts = Doubts((as_uncertain_again(cases) if found is None else found.of(cases),), SIGMA_INFLATION)
-        risk = self._policy.integrity_risk
-        return past_alert_limit(protection_of(doubts.levels(risk), risk), self._policy) is None
+            bound = bound_of(cases, risk, fits.model.alike(cam_T_grip))
+        elif (first := fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)) is None:
+            bound = first_bound_of(cases, risk)
+        else:  # by what may be wrong now, whatever a mount does
+            counts, none, limits = (0, count, count), np.zeros((6, 6)), limits_of(risk, SIGMA_INFLATION)
+            bound = level_of_motion(cases, counts, none, first, (none, True, 0.0, 0.0), limits)
+        return past_alert_limit(protection_of(bound, fits.hypotheses.name, risk), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
@@ -463,11 +457,6 @@ class Weigher:
 def _contradicts(way: Array, covariance: Array) -> bool:
     """Whether a motion (6,) is larger than its covariance (6, 6) allows."""
     return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
-
-
-def _named(bound: Bound, names: tuple[str, ...]) -> tuple[float, float, str]:
-    position_m, rotation_rad, number = bound
-    return position_m, rotation_rad, names[number] if number >= 0 else ""
 
 
 def _radii(covariance: Array, risk: float) -> list[float]:

@@ -16,7 +16,7 @@ from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array
 from gripmon.track.integrity.kernel import Bools, Ints, after_jumps, knocked, telling, with_known
 from gripmon.track.integrity.knocks import kinds_of, least_known
-from gripmon.track.integrity.level_kernel import doubted, levels, moved
+from gripmon.track.integrity.level_kernel import Bound, Limits, doubted, levels, moved
 
 Fits = tuple[Array, ...]
 """Shifts (h, 6), covariances (h, 6, 6) and errors by the model (h, f, 6)."""
@@ -41,25 +41,19 @@ Lasting = tuple[Fits, Array, Array, Array, Array, Ints, Array]
 """
 
 First = tuple[Fits, Array, Array, Array, Array, Array, Array]
-"""What makes fits those of the motion since the reference: ``begun`` to ``stays_at``, as for :func:`moved`."""
+"""What makes fits of a pose those of the motion since the reference, as for :func:`moved`: the fits at the reference as
+:func:`begun` has them, ``lever``, ``by_motion``, ``travel``, ``origin``, ``tcp`` and ``stays_at``.
+"""
 
 Mount = tuple[Array, bool, float, float]
 """How far a mount moves that stays (6, 6); whether the pose is elsewhere, or was since the reference; probabilities
 that it was knocked between the reference's images and the first frame, and since then, where nobody noticed.
 """
 
-Gathered = tuple[Array, Array, Array, Array, Ints, Ints]
-"""Cases: the fits as shifts (r, 6) from the published pose, covariances (r, 6, 6) and errors by the model (r, f, 6);
-``prior`` (r,), numbers of their names (r,) and of what goes with each at the reference (r,).
+Cases = tuple[Array, Array, Array, Array, Ints, Ints]
+"""What may be wrong with a published pose: the fits under it as shifts (r, 6) from that pose, covariances (r, 6, 6) and
+errors by the model (r, f, 6); ``prior`` (r,), numbers of names (r,) and of what goes with each at the reference (r,).
 """
-
-Bound = tuple[float, float, int]
-"""Protection levels of position and rotation, m and rad, and the number of the name of what the position's owes most
-to; -1: all is less probable than the risk.
-"""
-
-Limits = tuple[float, float, float, Array, float, Ints, float]
-"""The risk, the factor on standard deviations, and the levels' tolerance and tables, as for :func:`levels`."""
 
 
 @compiled
@@ -138,9 +132,7 @@ def begun(
 
 
 @compiled
-def _put(
-    fits: Fits, rows: Ints, away: Array, more: Array, prior: Array, called: Ints, into: Gathered, first: int
-) -> int:
+def _put(fits: Fits, rows: Ints, away: Array, more: Array, prior: Array, called: Ints, into: Cases, first: int) -> int:
     """The fits ``rows`` (r,), from ``away`` (6,) and with ``more`` (6, 6) on their covariances, of a ``prior`` (r,) and
     ``called`` (r,) so, into cases from the ``first`` on; the number of the next.
     """
@@ -173,7 +165,7 @@ def gathered(
     risk: float,
     least: float,
     times: float,
-) -> tuple[Gathered, tuple[int, int, int], Array, float]:
+) -> tuple[Cases, tuple[int, int, int], Array, float]:
     """What may be wrong with a pose (4, 4): it is as known, but for one hypothesis, or was knocked away from there;
     something has been wrong all along, or was in the reference's frames alone, of the priors ``first_prior`` (g,).
 
@@ -190,7 +182,7 @@ def gathered(
     average, from_T, origin_T, origin, wander, rows, lasting_prior = lasting
     (shift, own, off), (bare_shift, bare_own, bare_off), (place, before, known_off) = alone, bare_fits, known
     axis, ends, cosine, seen, unseen = knocks
-    share, jumps, along = kinds_of(least_known(covariance[ends], axis, cosine))
+    share, jumps, along, of_knock = kinds_of(least_known(covariance[ends], axis, cosine))
     fit, jump, weight, left_out = knocked(
         shift, own, off, place, before, known_off, jumps, share, along, solved, seen, unseen, stays, endless, least,
         times,
@@ -239,69 +231,60 @@ def gathered(
         into[5][ever + k] = k
     for k in range(1, many):
         into[5][last + k - 1] = k
-    of_knock = np.zeros((6, 6))
-    for c in range(len(share)):
-        for i in range(6):
-            for k in range(6):
-                of_knock[i, k] += share[c] * jumps[c, i, k]
     return into, (as_known, knocked_too, ever), of_knock, left_out
 
 
 @compiled
-def absolute_level(cases: Gathered, count: int, alike: Array, farther: Array, limits: Limits) -> Bound:
+def absolute_level(cases: Cases, count: int, alike: Array, farther: Array, limits: Limits) -> Bound:
     """The bound of a pose, by the first cases up to a number, and errors that they have alike, as for :func:`doubted`.
     """
     shift, covariance, off, prior, called, _ = cases
-    risk, inflation, near, squares, spacing, guide, step = limits
-    table, start = np.empty((7, count)), len(prior[:0])  # for a literal 0 numba compiles once more
-    share = risk / max(count, 1)
-    doubted(shift, covariance, off, prior[:count], alike, farther, inflation, share, table, start)
-    position, rotation, number = levels(
-        table[0], table[1:3], table[3:5], table[5:7], risk, near, squares, spacing, guide, step
+    table, share = np.empty((7, count)), limits[0] / max(count, 1)
+    doubted(shift, covariance, off, prior[:count], alike, farther, limits[1], share, table)
+    return levels(table, called, limits)
+
+
+@compiled
+def _moved(
+    cases: Cases, low: int, high: int, prior: Array, first: First, staying: Array, true: Array, knock: Array,
+    odds: float, limits: Limits, table: Array, names: Ints, at: int,
+) -> int:  # fmt: skip
+    """Cases from ``low`` to ``high``, of a ``prior`` (r,), into a table's columns from ``at`` on, with the numbers of
+    their ``names`` (n,); the next column.  The rest as for :func:`moved`.
+    """
+    shift, covariance, off, _, called, which = cases
+    (from_shift, from_covariance, from_off), lever, by_motion, travel, origin, tcp, stays_at = first
+    moved(
+        shift[low:high], covariance[low:high], off[low:high], prior[low:high], which[low:high], from_shift,
+        from_covariance, from_off, lever, by_motion, travel, origin, tcp, stays_at, staying, true, knock, odds,
+        limits[1], limits[0] / max(len(names), 1), table, at,
     )  # fmt: skip
-    return position, rotation, called[number] if number >= 0 else -1
+    for r in range(low, high):
+        names[at + r - low] = called[r]
+    return at + high - low
 
 
 @compiled
 def level_of_motion(
-    cases: Gathered, counts: tuple[int, int, int], spread: Array, first: First, mount: Mount, limits: Limits
+    cases: Cases, counts: tuple[int, int, int], knock: Array, first: First, mount: Mount, limits: Limits
 ) -> Bound:
     """The bound of the motion since the reference, by what is wrong now and by what may have been in its frames."""
-    shift, covariance, off, prior, called, which = cases
-    (from_shift, from_covariance, from_off), lever, by_motion, travel, origin, tcp, stays_at = first
-    (usual, moves, unwatched, unnoticed), (here, now, ever) = mount, counts
-    risk, inflation, near, squares, spacing, guide, step = limits
+    (usual, moves, unwatched, unnoticed), (here, now, ever), (_, _, _, prior, _, which) = mount, counts, cases
     # A file's tilt is by the true motion, not by what noise in fits looks like: once as of a mount that moves as usual,
     # and by all that fits show as probably as it was knocked unnoticed since the reference's frames.
-    by_truth, last, none = len(by_motion) > 1 and not moves, len(prior), np.zeros((0, 6))
-    true = usual if by_truth else none
+    by_truth, last, none = len(first[2]) > 1 and not moves, len(prior), np.zeros((0, 6))
     count = now + (here if by_truth else 0) + (2 if unwatched > 0.0 else 1) * (last - ever)
-    table, names, at = np.empty((7, count)), np.empty(count, np.intp), len(none)
-    staying: Array = none
-    for part in range(5):
-        low, high, times, staying, truth, odds = 0, here, 1.0, none, true, 0.0
-        if part == 1:
-            low, high, truth = here, now, none
-        elif part == 2:
-            # Nobody watched the mount from images to teach from until the first frame.  That nothing is wrong and it
-            # was knocked then is among what is wrong now, which doesn't rest on its staying.
-            low, high, times, staying, truth = ever, last if unwatched > 0.0 else ever, unwatched, usual + spread, none
-        elif part == 3:
-            high, odds = here if by_truth else 0, unnoticed
-        elif part == 4:
-            # Of a mount that creeps, vibrates and plays, and after a knock is where a knock moves it.
-            low, high, staying = ever, last, usual + spread if moves else usual
-        priors = prior[low:high].copy()
-        for r in range(high - low):
-            names[at + r] = called[low + r]
-            priors[r] *= times if part != 2 or which[low + r] > 0 else 0.0
-        moved(
-            shift[low:high], covariance[low:high], off[low:high], priors, which[low:high], from_shift, from_covariance,
-            from_off, lever, by_motion, travel, origin, tcp, stays_at, staying, truth, spread, odds, inflation,
-            risk / max(count, 1), table, at,
-        )  # fmt: skip
-        at += high - low
-    position, rotation, number = levels(
-        table[0], table[1:3], table[3:5], table[5:7], risk, near, squares, spacing, guide, step
-    )  # fmt: skip
-    return position, rotation, names[number] if number >= 0 else -1
+    table, names, start, true = np.empty((7, count)), np.empty(count, np.intp), len(none), usual if by_truth else none
+    at = _moved(cases, start, here, prior, first, none, true, knock, 0.0, limits, table, names, start)
+    at = _moved(cases, here, now, prior, first, none, none, knock, 0.0, limits, table, names, at)
+    if unwatched > 0.0:
+        # Nobody watched the mount from images to teach from until the first frame.  That nothing is wrong and it was
+        # knocked then is among what is wrong now, which doesn't rest on its staying.
+        then = prior * unwatched * (which > 0)
+        at = _moved(cases, ever, last, then, first, usual + knock, none, knock, 0.0, limits, table, names, at)
+    if by_truth:
+        at = _moved(cases, start, here, prior, first, none, true, knock, unnoticed, limits, table, names, at)
+    # Of a mount that creeps, vibrates and plays, and after a knock is where a knock moves it.
+    staying = usual + knock if moves else usual
+    _moved(cases, ever, last, prior, first, staying, true, knock, 0.0, limits, table, names, at)
+    return levels(table, names, limits)

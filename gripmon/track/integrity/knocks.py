@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,47 +56,29 @@ def log_likely(shift_m: Array) -> Array:
     return np.asarray(logsumexp(-beyond, axis=1, b=density / density.sum()))
 
 
-class Knocks(NamedTuple):
-    """Kinds of knocks, c of them: how probable each is once there is one, ``share`` (c,), and the ``covariance``
-    (c, 6, 6) of the motion, ``along`` (c,) those along the fingers.
-    """
-
-    share: Array
-    covariance: Array
-    along: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, axis_cam: Array) -> Knocks:
-        """With fingers in the direction ``axis_cam`` (3,), camera frame; zero: all knocks go anywhere."""
-        return cls(*kinds_of(axis_cam))
-
-    @property
-    def spread(self) -> Array:
-        """(6, 6) covariance of the motion by any knock."""
-        return np.asarray(np.einsum("c,cij->ij", self.share, self.covariance))
-
-
-_SHARE = np.concatenate([(1.0 - ALONG_OF_ALL) * np.array(ANY_SHARE), ALONG_OF_ALL * np.array(ALONG_SHARE)])
-
-
 @compiled
-def kinds_of(axis_cam: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Those of :class:`Knocks`."""
+def kinds_of(axis_cam: Array) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Kinds of knocks, c of them, with fingers in the direction ``axis_cam`` (3,), camera frame; zero: all go anywhere.
+    How probable each is once there is one (c,), the covariance (c, 6, 6) of the motion, whether it goes along the
+    fingers (c,), and the covariance (6, 6) of the motion by any knock.
+    """
     square, anywhere = 0.0, len(ANY_SHARE)
     for i in range(3):
         square += axis_cam[i] * axis_cam[i]
-    count = len(_SHARE) if square > 0.0 else anywhere
+    count, others = (anywhere + len(ALONG_SHARE), 1.0 - ALONG_OF_ALL) if square > 0.0 else (anywhere, 1.0)
     share, covariance, along = np.empty(count), np.zeros((count, 6, 6)), np.zeros(count, np.bool_)
+    spread = np.zeros((6, 6))
     for c in range(count):
-        share[c], along[c] = _SHARE[c] if square > 0.0 else ANY_SHARE[c], c >= anywhere
+        along[c] = c >= anywhere
+        share[c] = ALONG_OF_ALL * ALONG_SHARE[c - anywhere] if along[c] else others * ANY_SHARE[c]
         for i in range(6):
             if c < anywhere:
                 covariance[c, i, i] = ANY_SIGMA_M[c] ** 2 if i < 3 else TURN_SIGMA_RAD**2
-                continue
-            for k in range(3):
-                if i < 3:
+            elif i < 3:
+                for k in range(3):
                     covariance[c, i, k] = ALONG_SIGMA_M[c - anywhere] ** 2 * axis_cam[i] * axis_cam[k] / square
-    return share, covariance, along
+        spread += share[c] * covariance[c]
+    return share, covariance, along, spread
 
 
 @compiled

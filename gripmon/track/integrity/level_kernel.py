@@ -21,7 +21,13 @@ MOST_SIGMAS = 2.0
 fingers that are tilted by 30 degrees more, or less, point across the view, or at the camera.
 """
 
+Limits = tuple[float, float, float, Array, float, Ints, float]
+"""The risk, the factor on standard deviations, the tolerance of a level and its tables, for :func:`levels`."""
 
+Bound = tuple[float, float, int]
+"""Protection levels of position and rotation, m and rad, and the number of the name of what the position's owes most
+to; -1: all is less probable than the risk.
+"""
 
 
 @compiled
@@ -80,19 +86,18 @@ def doubted(
     inflation: float,
     share: float,
     table: Array,
-    first: int,
 ) -> None:
-    """Columns of a ``table`` (7, n) from the ``first`` on: ``prior`` (r,) of fits, and, where it is more than a
-    ``share``, how far they are away, ``shift`` (r, 6), position and rotation, each ``farther`` (2,), and the tails of
-    their errors, sigma twice and factor twice: by ``covariance`` (r, 6, 6) and errors by the model ``off`` (r, f, 6),
-    with those that all have, ``alike`` (p, 6).
+    """Columns of a ``table`` (7, r): ``prior`` (r,) of fits, and, where it is more than a ``share``, how far they are
+    away, ``shift`` (r, 6), position and rotation, each ``farther`` (2,), and the tails of their errors, sigma twice and
+    factor twice: by ``covariance`` (r, 6, 6) and errors by the model ``off`` (r, f, 6), with those that all have,
+    ``alike`` (p, 6).
     """
     for r in range(len(prior)):
-        table[0, first + r] = prior[r]
+        table[0, r] = prior[r]
         if prior[r] > share:
-            _enter(shift[r], covariance[r], off[r], alike, inflation, table, first + r)
+            _enter(shift[r], covariance[r], off[r], alike, inflation, table, r)
             for part in range(2):
-                table[1 + part, first + r] += farther[part]
+                table[1 + part, r] += farther[part]
 
 
 @compiled
@@ -131,26 +136,15 @@ def _beyond(square: float, factor: float, squares: Array, spacing: float, guide:
 
 
 @compiled
-def levels(
-    prior: Array,
-    away: Array,
-    sigma: Array,
-    factor: Array,
-    risk: float,
-    near: float,
-    squares: Array,
-    spacing: float,
-    guide: Ints,
-    step: float,
-) -> tuple[float, float, int]:
-    """Protection levels of position and of rotation, m and rad, and the number of the hypothesis that the position's
-    owes most to; -1 where all together are less probable than the risk.
+def levels(table: Array, called: Ints, limits: Limits) -> Bound:
+    """The bound by a table's columns, as of :func:`doubted`, which are ``called`` (h,) by these numbers.
 
-    The levels are where the sum over the hypotheses of ``prior`` (h,) times the tail beyond level - ``away`` (2, h) is
-    ``risk``, found between bounds by halving their ratio's logarithm down to a factor ``near``; the larger end counts.
-    Those of less than an equal share of the risk take their ``prior`` off it.  ``squares`` to ``step``: the tables of
-    :mod:`~gripmon.track.integrity.quantiles`.
+    The levels are where the sum over the hypotheses of their priors times the tail beyond level - away is the risk,
+    found between bounds by halving their ratio's logarithm down to the tolerance, a factor; the larger end counts.
+    Those of less than an equal share of the risk take their prior off it.
     """
+    prior, away, sigma, factor = table[0], table[1:3], table[3:5], table[5:7]
+    risk, _, near, squares, spacing, guide, step = limits
     share, left, count = risk / len(prior), risk, 0
     for h in range(len(prior)):
         if prior[h] > share:
@@ -194,7 +188,7 @@ def levels(
             part_of_it = prior[h] * _beyond(length * length, factor[0, h], squares, spacing, guide, step)
             if part_of_it > largest:
                 largest, owed = part_of_it, h
-    return most[0], most[1], owed
+    return most[0], most[1], called[owed]
 
 
 @compiled

@@ -7,9 +7,8 @@ import numpy as np
 from gripmon.model.geometry import invert, perturb, perturbation_between, skew
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Array
-from gripmon.track.integrity import Cases, Doubts, Knocks, Moved, Separation
 from gripmon.track.integrity.kernel import Ints
-from gripmon.track.integrity.knocks import least_known
+from gripmon.track.integrity.knocks import kinds_of, least_known
 from gripmon.track.integrity.level_kernel import MOST_SIGMAS
 from gripmon.track.integrity.separation import QUANTILES, Tails
 
@@ -161,9 +160,8 @@ def beyond(tails: Tails, radius: Array) -> Array:
     return np.asarray(10.0 ** np.minimum(one, three))
 
 
-def levels(
-    prior: Array, away: Array, sigma: Array, factor: Array, risk: float, near: float, *_tables: object
-) -> tuple[float, float, int]:
+def levels(table: Array, called: Ints, limits: tuple) -> tuple[float, float, int]:
+    (prior, away, sigma, factor), (risk, _, near, *_) = (table[0], table[1:3], table[3:5], table[5:7]), limits
     share = risk / max(len(prior), 1)
     counted = np.flatnonzero(prior > share)
     if not len(counted):
@@ -181,7 +179,7 @@ def levels(
         enough = (prior * beyond(tails, middle[:, None] - away)).sum(axis=1) <= left
         least, most = np.where(enough, least, middle), np.where(enough, middle, most)
     owed = prior * beyond(tails, most[:, None] - away)[0]
-    return float(most[0]), float(most[1]), int(counted[np.argmax(owed)])
+    return float(most[0]), float(most[1]), int(called[counted[np.argmax(owed)]])
 
 
 def follow(
@@ -207,11 +205,10 @@ def doubted(
     inflation: float,
     share: float,
     table: Array,
-    first: int,
 ) -> None:
     every = np.broadcast_to(alike, (len(prior), *alike.shape))
     fits = shift, covariance, np.concatenate([off, every], axis=1)
-    enter(table, first, prior, share, tails(*fits, inflation), farther)
+    enter(table, 0, prior, share, tails(*fits, inflation), farther)
 
 
 def enter(
@@ -369,16 +366,17 @@ def gathered(
     fit_T, alone, anchored, covariance, floor = frame
     axis, ends, cosine, *odds = of_knocks
     average, from_T, origin_T, origin, wander, rows, lasting_prior = lasting
-    away, knocks = perturbation_between(fit_T, cam_T_grip), Knocks.of(least_known(covariance[ends], axis, cosine))
+    share, jumps, along, spread = kinds_of(least_known(covariance[ends], axis, cosine))
+    away = perturbation_between(fit_T, cam_T_grip)
     h, b, g, many, nowhere, left_out = len(solved), len(bare[1][0]), len(rows), len(first_prior), np.zeros(6), 0.0
     here = np.flatnonzero(doubts[1])
     # The fits, which of them, the pose that they count from, what their covariances lack, priors, names.
     sets, counts = [(anchored, here, away, floor, doubts[0][here], here)], [len(here)]
     for fits, (prior, stays, endless), base in ((alone, (solved, *doubts[1:]), 0), (*bare, h)):
         if len(prior):
-            kinds = knocks.covariance, knocks.share, knocks.along
-            fit, jump, weight, out = knocked(*fits, *known, *kinds, prior, *odds, stays, endless, least, times)
-            after = after_jumps(*fits, *known, knocks.covariance, fit, jump, weight, 0.0)
+            of = jumps, share, along, prior, *odds, stays, endless, least, times
+            fit, jump, weight, out = knocked(*fits, *known, *of)
+            after = after_jumps(*fits, *known, jumps, fit, jump, weight, 0.0)
             sets.append((after, np.arange(len(fit)), away, floor, weight, base + fit))
             left_out += out
     counts.append(sum(len(each[1]) for each in sets))
@@ -404,20 +402,14 @@ def gathered(
         )
     ]
     which = np.concatenate([np.zeros(counts[2], np.intp), every, numbers])
-    return (*cases, which), tuple(counts), knocks.spread, left_out
+    return (*cases, which), tuple(counts), spread, left_out
 
 
 def absolute_level(cases: tuple, count: int, alike: Array, farther: Array, limits: tuple) -> tuple[float, float, int]:
-    shift, covariance, off, prior, called, _ = cases
-    fits = Separation(shift[:count], covariance[:count], off[:count])
-    of = Cases.of(tuple(map(str, called)), prior[:count], fits)
-    return bound((of._replace(alike=alike, farther=farther),), limits)
-
-
-def bound(sets: tuple, limits: tuple) -> tuple[float, float, int]:
-    """Of sets whose names are numbers."""
-    *both, name = Doubts(sets, limits[1]).levels(limits[0])
-    return *both, int(name or -1)
+    *fits, called, _ = (each[:count] for each in cases)
+    table = np.empty((7, count))
+    doubted(*fits, alike, farther, limits[1], limits[0] / max(count, 1), table)
+    return levels(table, called, limits)
 
 
 def level_of_motion(
@@ -425,20 +417,20 @@ def level_of_motion(
 ) -> tuple[float, float, int]:
     """Set by set."""
     shift, covariance, off, prior, called, which = cases
-    (usual, moves, unwatched, unnoticed), (here, now, ever) = mount, counts
-    name, since, none = tuple(map(str, called)), (Separation(*first[0]), *first[1:]), np.zeros((0, 6))
-
-    def of_motion(rows: range, times: float, staying: Array, **true: object) -> Moved:
-        some = np.array(rows, np.intp)
-        of = Cases(prior[some] * times, name, some, Separation(shift[some], covariance[some], off[some]))
-        return Moved(of.prior, of, which[some], *since, staying, **true)
-
-    by_truth, lasts = len(first[2]) > 1 and not moves, range(ever, len(prior))
-    true = {"usual": usual} if by_truth else {}
-    sets = [of_motion(range(here), 1.0, none, **true), of_motion(range(here, now), 1.0, none)]
+    (usual, moves, unwatched, unnoticed), (here, now, ever), none = mount, counts, np.zeros((0, 6))
+    by_truth, lasts, at_once = len(first[2]) > 1 and not moves, np.arange(ever, len(prior)), np.arange(here)
+    true = usual if by_truth else none
+    # Which cases, their priors, and of the motion: what is known of it, and what of the true one.
+    sets = [(at_once, prior, none, true, 0.0), (np.arange(here, now), prior, none, none, 0.0)]
     if unwatched:
-        sets.append(of_motion(lasts, unwatched * (which[ever:] > 0), usual + spread))
+        sets.append((lasts, prior * unwatched * (which > 0), usual + spread, none, 0.0))
     if by_truth:
-        sets.append(of_motion(range(here), 1.0, none, usual=usual, knock=spread, odds=unnoticed))
-    sets.append(of_motion(lasts, 1.0, usual + spread if moves else usual, **true))
-    return bound(tuple(sets), limits)
+        sets.append((at_once, prior, none, usual, unnoticed))
+    sets.append((lasts, prior, usual + spread if moves else usual, true, 0.0))
+    names = np.concatenate([called[rows] for rows, *_ in sets])
+    table, at = np.empty((7, len(names))), 0
+    for rows, priors, *known, odds in sets:
+        of = shift[rows], covariance[rows], off[rows], priors[rows], which[rows], *first[0], *first[1:], *known
+        moved(*of, spread, odds, limits[1], limits[0] / max(len(names), 1), table, at)
+        at += len(rows)
+    return levels(table, names, limits)
