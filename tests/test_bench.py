@@ -9,6 +9,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 SIZE = (384, 288)
@@ -138,3 +139,15 @@ def test_stop_watches_count_every_nanosecond_once(monkeypatch: pytest.MonkeyPatc
     watches.counting = False
     outer()
     assert sum(watches.total_ns.values()) == 5
+
+
+def test_the_ring_goes_back_without_repeating_an_image_to_the_bit():
+    from benchmarks.scene import Ring
+
+    images, none = np.random.default_rng(1).integers(0, 256, (4, 6, 8)).astype(np.uint8), np.zeros(4)
+    ring = Ring(images, images, none, np.zeros((4, 3)), none > 0.0)
+    assert [ring.place(seq) for seq in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
+    for forth, back in ((2, 4), (1, 5)):
+        one, other = (ring.frame(seq).image.astype(int) for seq in (forth, back))
+        assert (np.abs(one - other) == 1).all()
+    np.testing.assert_array_equal(ring.frame(6).image, images[0])
