@@ -13,8 +13,8 @@ from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
 from gripmon.monitor.bounds import SIGMA_INFLATION, bound_of
 from gripmon.monitor.since import AtReference, Opened
-from gripmon.track.integrity import Separation, bounds, hypotheses_of, with_known
-from gripmon.track.integrity.kernel import telling
+from gripmon.track.integrity import bounds, hypotheses_of
+from gripmon.track.integrity.kernel import telling, with_known
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 SAID = tuple(f"edge {name}" for name in NAMES)
@@ -95,8 +95,8 @@ def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray
     average, from_T, origin_T, origin = anchor.known
     at, way = perturbation_between(from_T, frame.cam_T_grip), wander / SIGMA_INFLATION**2
     own = frame.shifts(frame.cam_T_grip), frame.covariance, frame.of_model
-    told = Separation(*telling(*average, at, way, *own, ROWS, CONTRADICTION_SQUARE))
-    known = with_known(told, perturbation_between(frame.cam_T_grip, origin_T), origin + np.diag(way))
+    told = telling(*average, at, way, *own, ROWS, CONTRADICTION_SQUARE)
+    known = with_known(*told, perturbation_between(frame.cam_T_grip, origin_T), origin + np.diag(way))
     return bound_of((*known, LASTING.priors(SURE), ROWS, ROWS), risk)[0]
 
 

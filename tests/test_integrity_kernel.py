@@ -11,10 +11,10 @@ from support.by_numpy import integrity as by_numpy
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
-from gripmon.monitor import Monitor, bounds, refits, weigher
+from gripmon.monitor import Monitor, anchor, bounds, refits, weigher
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.track.integrity import Separation, frame_kernel, kernel, level_kernel, separation
+from gripmon.track.integrity import Separation, frame_kernel, kernel, level_kernel
 from gripmon.track.integrity.separation import Tails, limits_of
 
 SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
@@ -345,8 +345,8 @@ KNOCKED_AT = 15  # frame
 
 def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[FrameRecord]:
     """Of the demo's camera over half a second, with a knock in the middle."""
-    monkeypatch.setattr(separation, "kernel", by)
-    monkeypatch.setattr(refits, "refitted", by.refitted)
+    for room, name in ((refits, "refitted"), (anchor, "follow"), (anchor, "with_known")):
+        monkeypatch.setattr(room, name, getattr(by, name))
     for name in ("gathered", "absolute_level", "level_of_motion"):
         monkeypatch.setattr(weigher, name, getattr(frame_kernel if by is kernel else by, name))
     monkeypatch.setattr(bounds, "absolute_level", weigher.absolute_level)

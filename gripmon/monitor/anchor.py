@@ -21,8 +21,9 @@ from gripmon.model.records import Array, Protection
 from gripmon.monitor.bounds import bound_of, protection_of
 from gripmon.monitor.refits import Refits
 from gripmon.monitor.since import FIRST_FRAMES
-from gripmon.track.integrity import Hypotheses, Separation, follow, with_known
+from gripmon.track.integrity import Hypotheses, Separation
 from gripmon.track.integrity.frame_kernel import Fits
+from gripmon.track.integrity.kernel import follow, with_known
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
@@ -144,7 +145,8 @@ class Anchor:
         frame = _chosen(fits, rows, self._base_T)
         self._newest.append((frame.shift[0], frame.covariance[0]))
         innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
-        self._filters, gains = follow(self._filters, frame, creep)
+        *averages, gains = follow(*self._filters, *frame, creep)
+        self._filters = Separation(*averages)
         origin_T, known = self._origin
         self._origin = origin_T, known + np.diag(creep)
         share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
@@ -204,7 +206,7 @@ class Anchor:
     def _with_origin(self, fits: Separation, at_T: Array) -> Separation:
         """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before."""
         origin_T, covariance = self._origin
-        return with_known(fits, perturbation_between(at_T, origin_T), covariance)
+        return Separation(*with_known(*fits, perturbation_between(at_T, origin_T), covariance))
 
     @property
     def known(self) -> tuple[Fits, Array, Array, Array]:

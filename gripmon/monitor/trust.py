@@ -330,13 +330,14 @@ class Integrity:
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or self._past_limit(trust.bounds)):
             return self._by_anchor(frame, candidate, now_s)
-        where_it_was = self._weigher.proved and not trust.displaced
+        proved = self._weigher.proved
+        where_it_was = proved and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px, along.here)
         knocked = moved and beside_px >= ONE_EDGE_PX
         proves = trust.proven and (moved or not trust.displaced)
-        unproven = self._weigher.proved and not proves
-        if trust.fits is not None and (proves or not (trust.displaced or self._weigher.proved)):
+        unproven = proved and not proves
+        if trust.fits is not None and (proves or not (trust.displaced or proved)):
             before = self._weigher.anchor
             self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
             assert self._weigher.anchor is not None

@@ -177,11 +177,12 @@ class Weigher:
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
         odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
         besides = odds[1] * prior[hypotheses.ends]
-        without = self._without_ends(fits, besides, displaced)
+        unsettled = displaced or not self.proved
+        without = self._without_ends(fits, besides, unsettled)
         both, knock = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
-        made_of = without if without is not None and not proven and (displaced or not self.proved) else fits
+        made_of = without if without is not None and not proven and unsettled else fits
         if without is not None and displaced and not slid and ends is not None and self._sure(without, cam_T_grip):
             proven, made_of = True, without
         # What was taken for the ends when the strips were learnt looks right ever after.
@@ -317,14 +318,14 @@ class Weigher:
         covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
         return _contradicts(way, covariance)
 
-    def _without_ends(self, fits: Refits, besides: float, displaced: bool) -> Refits | None:
+    def _without_ends(self, fits: Refits, besides: float, unsettled: bool) -> Refits | None:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
-        probability ``besides``, doesn't count.
+        probability ``besides``, doesn't count.  ``unsettled``: of a pose that is displaced, or before one is proved.
         """
         if not fits.hypotheses.across.any():
             return fits
         about = self._possible.about(fits.edges)
-        if displaced or not self.proved:
+        if unsettled:
             return fits.under(about.without_ends)
         return None if besides * WRONG_EDGE <= self._least else fits.under(about.pairs)
 

@@ -2,15 +2,13 @@
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
 from gripmon.track.integrity.knocks import Mount
-from gripmon.track.integrity.separation import Separation, bounds, follow, warm_up, with_known
+from gripmon.track.integrity.separation import Separation, bounds, warm_up
 
 __all__ = [
     "Hypotheses",
     "Mount",
     "Separation",
     "bounds",
-    "follow",
     "hypotheses_of",
     "warm_up",
-    "with_known",
 ]

@@ -73,19 +73,6 @@ class Separation(NamedTuple):
     of_model: Array
 
 
-def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:
-    """A bank of g Kalman filters, the same average once under each hypothesis, after one more measurement, the pose
-    having crept by the variances ``creep`` (6,) since the one before; and the traces (g,) of the gains.
-    """
-    *after, gains = kernel.follow(*averages, *frame, creep)
-    return Separation(*after), gains
-
-
-def with_known(fits: Separation, at: Array, covariance: Array) -> Separation:
-    """The fits, each joined with what is known of all of them besides: ``at`` (6,) but for a ``covariance`` (6, 6)."""
-    return Separation(*kernel.with_known(*fits, at, covariance))
-
-
 class Tails(NamedTuple):
     """How probably normal vectors are longer than something: ``sigma`` (...,) along the longest axis of each, and the
     power of ten ``factor`` (...,) by which the two others raise the tail of that one.
@@ -130,12 +117,12 @@ def warm_up() -> None:
         each, row = np.tile(np.eye(m), (2, 1, 1)), np.zeros((2, m))
         of = row, each, each, row, edge, edge, 1, none[:3], whole, yes, np.ones(m), 0.0, 1.0
         _, at, alone, _, _ = kernel.refitted(here, np.zeros(m), *of, here, np.eye(6), np.zeros((1, 6)), 1.0, True)
-    fits = follow(Separation(*alone), Separation(*alone), none)[0]
-    with_known(fits, none, np.eye(6))
-    begun, lever, moved, tcp, unmoved = frame_kernel.begun(here, here, here, *fits, np.eye(6))
+    kernel.follow(*alone, *alone, none)
+    kernel.with_known(*alone, none, np.eye(6))
+    begun, lever, moved, tcp, unmoved = frame_kernel.begun(here, here, here, *alone, np.eye(6))
     frame_kernel.motion_since(here, here, here)
-    doubts, frame = (some, yes, yes), (here, alone, alone, fits.covariance, np.eye(6))
-    bare, knocks, before = (alone, doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), fits.of_model[0])
+    doubts, frame = (some, yes, yes), (here, alone, alone, alone[1], np.eye(6))
+    bare, knocks, before = (alone, doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), alone[2][0])
     lasting, limits = (alone, here, here, np.eye(6), none, edge, some), limits_of(1e-5, 1.0)
     cases, counts, knock, _ = frame_kernel.gathered(
         here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
