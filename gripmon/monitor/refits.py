@@ -42,12 +42,14 @@ class Anchored(NamedTuple):
 
 class Known(NamedTuple):
     """The anchor as a measurement: its pose (4, 4), the covariance (6, 6), and its error (f, 6) where a finger's length
-    is off by its standard deviation, or (1, 6) of zeros.
+    is off by its standard deviation, or (1, 6) of zeros.  ``wander`` (6,): the part of that covariance that is by the
+    motion since.
     """
 
     anchor_T: Array
     covariance: Array
     of_model: Array
+    wander: Array = np.zeros(6)
 
 
 class Refits:

@@ -175,11 +175,12 @@ class Weigher:
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
-        odds = self._knocked(now_s, hidden=False), 1.0 if may_have_slid else self._knocked(now_s, hidden=True)
+        knocked = self._knocked(now_s)
+        odds = knocked, 1.0 if may_have_slid else max(knocked, KNOCK_UNSEEN_PROBABILITY)
         besides = odds[1] * prior[hypotheses.ends]
         unsettled = displaced or not self.proved
         without = self._without_ends(fits, besides, unsettled)
-        both, knock = self._bounds(fits, without, prior, odds, cam_T_grip, displaced, now_s)
+        both, knock = self._bounds(fits, without, prior, odds, cam_T_grip, displaced)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = without if without is not None and not proven and unsettled else fits
@@ -258,7 +259,6 @@ class Weigher:
         odds: tuple[float, float],
         cam_T_grip: Array,
         displaced: bool,
-        now_s: float,
     ) -> tuple[Bounds, Array]:
         """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
         is as known, and after the knocks that the mount may have got since, by the fits and by those ``without`` ends,
@@ -277,7 +277,7 @@ class Weigher:
             of, names = without.hypotheses, names + without.hypotheses.name
             bare = without.alone, (prior[ends] * of.prior * of.more_than_ends, without.stays, of.endless)
         names += lasting.name + in_the_references_frames(lasting.name)
-        rows, wander = self._possible.about(fits.edges).rows, self._wander(now_s)
+        rows, wander = self._possible.about(fits.edges).rows, fits.known.wander
         at_first = prior[:0] if first is None else lasting.priors(first.misread)
         always = (none, cam_T_grip, *self.expected, wander, rows[:0], prior[:0])
         if anchor is not None and not displaced:
@@ -391,13 +391,13 @@ class Weigher:
             *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
 
-    def _knocked(self, now_s: float, hidden: bool) -> float:
-        """Probability that the mount was knocked since the pose was last proven, or since the reference's images;
-        ``hidden``: something hides what would show it.
+    def _knocked(self, now_s: float) -> float:
+        """Probability that the mount was knocked since the pose was last proven, or since the reference's images, if
+        nothing hides what would show it.
         """
         if self.anchor is None:
             return KNOCK_UNSEEN_PROBABILITY
-        return self._mount.knocked(now_s - self.anchor.now_s, hidden)
+        return self._mount.knocked(now_s - self.anchor.now_s, hidden=False)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """See :meth:`EndsEvidence.confirmations`."""
@@ -407,7 +407,8 @@ class Weigher:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
-        excluded = self._knocked(now_s, hidden=True) * self._ends.sides_misread(measurement)
+        knocked = max(self._knocked(now_s), KNOCK_UNSEEN_PROBABILITY)
+        excluded = knocked * self._ends.sides_misread(measurement)
         return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
@@ -447,7 +448,8 @@ class Weigher:
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             expected_T, covariance = self.expected
             of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
-            known = Known(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
+            wander = self._wander(now_s)
+            known = Known(expected_T, covariance + np.diag(wander), of_model, wander)
             model = self._possible.model._replace(first=self._since.published_by)
             hypotheses = self._possible.about(measurement.normal.edge).hypotheses
             floor = self._tracker.floor_of(measurement)
