@@ -11,10 +11,12 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.records import Since
 from gripmon.monitor.anchor import CONFIRMING_FRAMES, NO_FIT, Anchor, Lasting, average_of
-from gripmon.monitor.bounds import SIGMA_INFLATION, bound_of
+from gripmon.monitor.bounds import SIGMA_INFLATION
 from gripmon.monitor.since import AtReference, Opened
 from gripmon.track.integrity import bounds, hypotheses_of
+from gripmon.track.integrity.frame_kernel import absolute_level
 from gripmon.track.integrity.kernel import telling, with_known
+from gripmon.track.integrity.separation import limits_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 SAID = tuple(f"edge {name}" for name in NAMES)
@@ -97,7 +99,8 @@ def level_m(anchor: Anchor, frame: Frame, risk: float = 1e-5, wander: np.ndarray
     own = frame.shifts(frame.cam_T_grip), frame.covariance, frame.of_model
     told = telling(*average, at, way, *own, ROWS, CONTRADICTION_SQUARE)
     known = with_known(*told, perturbation_between(frame.cam_T_grip, origin_T), origin + np.diag(way))
-    return bound_of((*known, LASTING.priors(SURE), ROWS, ROWS), risk)[0]
+    cases, exact = (*known, LASTING.priors(SURE), ROWS, ROWS), (np.zeros((0, 6)), np.zeros(2))
+    return absolute_level(cases, len(ROWS), *exact, limits_of(risk, SIGMA_INFLATION))[0]
 
 
 def error_m(frame: Frame, truth: np.ndarray = STILL) -> float:

@@ -11,7 +11,7 @@ from support.by_numpy import integrity as by_numpy
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import perturb
 from gripmon.model.records import FrameRecord
-from gripmon.monitor import Monitor, anchor, bounds, refits, weigher
+from gripmon.monitor import Monitor, anchor, refits, weigher
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
 from gripmon.track.integrity import Separation, frame_kernel, kernel, level_kernel
@@ -320,9 +320,9 @@ def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatch
     many = 0 if displaced else 5
     lasting = tuple(fits(rng, many)), from_T, origin_T, origin, wander, rng.integers(-1, count, many), prior[1, :many]
     of = frame, (prior[0], *some[:2]), prior[0] * some[3], besides, before, (axis, count - 1, 0.5, 1e-3, 0.1)
-    of = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-5, 1e-7, 1.44
-    cases, counts, spread, left = frame_kernel.gathered(*of)
-    expected, numbers, knock, out = by_numpy.gathered(*of)
+    what = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-7
+    cases, counts, spread, left = frame_kernel.gathered(1e-5, 1.44, *what)
+    expected, numbers, knock, out = by_numpy.gathered(1e-5, 1.44, *what)
     probable = expected[3] > 1e-6
     assert counts == numbers and probable.any() and len(cases[3]) == len(probable)
     agree([each[probable] for each in cases], [each[probable] for each in expected])
@@ -330,14 +330,20 @@ def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatch
     limits = limits_of(1e-5 - left, 1.2)
     common, tilt = (of_the_model(rng, 1)[0], np.array([1e-4, 1e-3])), 0.1 * rng.normal(size=(kinds, 6, 3))
     since = tuple(first), np.eye(6), tilt, shifts(rng, 1)[0], *(0.1 * rng.normal(size=(2, 3))), shifts(rng, 1)[0]
-    for moves in (displaced, True):
-        of = cases, counts, spread, since, (usual, moves, unwatched, 1e-4), limits
-        one, other = frame_kernel.level_of_motion(*of), by_numpy.level_of_motion(*of)
-        assert one[2] == other[2] >= 0
-        np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
-    one, other = (by.absolute_level(cases, counts[2], *common, limits) for by in (frame_kernel, by_numpy))
-    assert one[2] == other[2] >= 0
-    np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+    begins = tuple(fits(rng, 0)), *since[1:]
+    absolute = [by.absolute_level(cases, counts[2], *common, limits) for by in (frame_kernel, by_numpy)]
+    for moves, begun in ((displaced, since), (True, since), (True, begins)):
+        mount = usual, moves, unwatched, 1e-4
+        of_motion = [
+            by.level_of_motion(cases, counts, spread, begun, mount, limits) for by in (frame_kernel, by_numpy)
+        ]
+        for one, other in (absolute, of_motion):
+            assert one[2] == other[2] >= 0
+            np.testing.assert_allclose(one[:2], other[:2], rtol=1e-9)
+        both = frame_kernel.frame_bounds(what, common, begun, mount, limits_of(1e-5, 1.2))
+        assert both[:2] == (absolute[0], of_motion[0]) and np.array_equal(both[2], spread)
+    too_much = frame_kernel.frame_bounds(what, common, since, mount, limits_of(left, 1.2))
+    assert too_much[0][0] == too_much[1][0] == np.inf
 
 
 KNOCKED_AT = 15  # frame
@@ -347,9 +353,9 @@ def records(by: object, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[Fram
     """Of the demo's camera over half a second, with a knock in the middle."""
     for room, name in ((refits, "refitted"), (anchor, "follow"), (anchor, "with_known")):
         monkeypatch.setattr(room, name, getattr(by, name))
-    for name in ("gathered", "absolute_level", "level_of_motion"):
-        monkeypatch.setattr(weigher, name, getattr(frame_kernel if by is kernel else by, name))
-    monkeypatch.setattr(bounds, "absolute_level", weigher.absolute_level)
+    bounds = (weigher, "frame_bounds"), (refits, "absolute_level"), (refits, "level_of_motion")
+    for room, name in (*bounds, (anchor, "absolute_level")):
+        monkeypatch.setattr(room, name, getattr(frame_kernel if by is kernel else by, name))
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     knock = Bump(at_s=KNOCKED_AT / 60.0, translation_m=(0.0, 1e-3, 2e-3))
     scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))

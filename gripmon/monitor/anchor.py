@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from gripmon.judge.smoothing import LEAST_KEPT_RATIO, MOST_SCATTER
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Protection
-from gripmon.monitor.bounds import bound_of, protection_of
+from gripmon.monitor.bounds import SIGMA_INFLATION, protection_of
 from gripmon.monitor.refits import Refits
 from gripmon.monitor.since import FIRST_FRAMES
 from gripmon.track.integrity import Hypotheses, Separation
-from gripmon.track.integrity.frame_kernel import Fits
+from gripmon.track.integrity.frame_kernel import Fits, absolute_level
 from gripmon.track.integrity.kernel import follow, with_known
+from gripmon.track.integrity.separation import limits_of
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """Weight of the prior (errors don't scatter at all), and number over which the scatter is averaged, frames."""
@@ -201,7 +202,9 @@ class Anchor:
         """The protection level of the average itself."""
         fits, every = self._with_origin(self.fits(), self.cam_T_grip), np.arange(len(self._lasting.name))
         cases = *fits, self._lasting.priors(self.misread), every, every
-        return protection_of(bound_of(cases, risk), self._lasting.name, risk)
+        limits = limits_of(risk, SIGMA_INFLATION)
+        bound = absolute_level(cases, len(every), np.zeros((0, 6)), np.zeros(2), limits)
+        return protection_of(bound, self._lasting.name, risk)
 
     def _with_origin(self, fits: Separation, at_T: Array) -> Separation:
         """Fits as shifts from ``at_T`` (4, 4), joined with what was known of the pose before."""

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from gripmon.model.records import Array, Protection
 from gripmon.monitor.common import CommonError
 from gripmon.monitor.since import AtReference, Bounds, Opened
-from gripmon.track.integrity.frame_kernel import Cases, First, absolute_level
+from gripmon.track.integrity.frame_kernel import First
 from gripmon.track.integrity.level_kernel import Bound
-from gripmon.track.integrity.separation import limits_of
 
 SIGMA_INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
@@ -39,29 +38,20 @@ class ModelError(NamedTuple):
         """Number of the gripper's parts that may be off: its fingers, and its edges each by itself."""
         return self.fingers + len(self.finger)
 
-    def differences(self, cam_T_grip: Array, opened: Opened, swing: Array) -> First | None:
-        """What makes fits near a pose (4, 4) fits of the motion since the reference; None while nothing was measured
-        there.  ``swing`` (6,): variances of the mount's vibration.
+    def differences(self, cam_T_grip: Array, opened: Opened, swing: Array) -> First:
+        """What makes fits near a pose (4, 4) fits of the motion since the reference.  ``swing`` (6,): variances of the
+        mount's vibration.
         """
         first, reference_T = self.first
-        return None if first is None else first.differences(cam_T_grip, reference_T, opened, self.common, swing)
+        if first is not None:
+            return first.differences(cam_T_grip, reference_T, opened, self.common, swing)
+        begun, nowhere = (np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, self.parts, 6))), np.zeros(6)
+        return begun, np.eye(6), np.zeros((0, 6, 3)), nowhere, nowhere[:3], nowhere[:3], nowhere
 
     def alike(self, cam_T_grip: Array) -> tuple[Array, Array]:
         """What all fits near a pose (4, 4) are off by: by standard deviations (p, 6), and by these lengths (2,)."""
         common = self.common
         return (np.zeros((0, 6)), np.zeros(2)) if common is None else (common.alike(cam_T_grip), common.farther)
-
-
-def bound_of(cases: Cases, risk: float, alike: tuple[Array, Array] | None = None) -> Bound:
-    """The bound by cases, and by what they are off by ``alike`` if :meth:`ModelError.alike` has something."""
-    alike_sigma, farther = alike or (np.zeros((0, 6)), np.zeros(2))
-    return absolute_level(cases, len(cases[3]), alike_sigma, farther, limits_of(risk, SIGMA_INFLATION))
-
-
-def first_bound_of(cases: Cases, risk: float, rows: NDArray[np.intp] | slice = slice(None)) -> Bound:
-    """Of the motion since the reference, by some cases, while this frame is the first one: its errors count twice."""
-    shift, covariance, off, prior, called, which = cases
-    return bound_of((shift[rows], 2.0 * covariance[rows], off[rows][:, :0], prior[rows], called[rows], which), risk)
 
 
 def unbounded(risk: float, why: str) -> Bounds:

@@ -13,15 +13,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturb
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Frame, ReferenceRecord, Since
 from gripmon.monitor.anchor import Lasting, average_of
-from gripmon.monitor.bounds import (
-    UNBOUNDED_M,
-    UNBOUNDED_RAD,
-    ModelError,
-    bound_of,
-    first_bound_of,
-    protection_of,
-    unbounded,
-)
+from gripmon.monitor.bounds import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, unbounded
 from gripmon.monitor.common import CommonError, Tilt
 from gripmon.monitor.ends import EndsEvidence, proof
 from gripmon.monitor.refits import Known, Refits
@@ -155,7 +147,5 @@ def foresee_bounds(tracker: Tracker, gripper: Gripper, settings: MonitorSettings
     hypotheses = possible.hypotheses(measurement.normal.edge)
     known, floor = _nothing_known(cam_T_grip), tracker.floor_of(measurement)
     fits = Refits(measurement, hypotheses, floor, possible.model, known)
-    cases = fits.cases(cam_T_grip, np.flatnonzero(~hypotheses.sudden))
-    risk = settings.policy.integrity_risk
-    both = bound_of(cases, risk, possible.model.alike(cam_T_grip)), first_bound_of(cases, risk)
-    return Bounds(*(protection_of(each, hypotheses.name, risk) for each in both))
+    risk, lasting = settings.policy.integrity_risk, np.flatnonzero(~hypotheses.sudden)
+    return fits.bounds(cam_T_grip, lasting, np.zeros(6), risk)

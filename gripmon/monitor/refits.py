@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from gripmon.model.least_squares import CONTRADICTION_SQUARE
 from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
-from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError
-from gripmon.monitor.since import Opened
+from gripmon.monitor.bounds import SIGMA_INFLATION, ModelError, protection_of
+from gripmon.monitor.since import Bounds, Opened
 from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.track.integrity import Hypotheses
-from gripmon.track.integrity.frame_kernel import Cases, Fits, Frame
+from gripmon.track.integrity.frame_kernel import Fits, Frame, absolute_level, level_of_motion
 from gripmon.track.integrity.kernel import refitted
+from gripmon.track.integrity.separation import limits_of
 
 
 @cache
@@ -110,11 +111,17 @@ class Refits:
         """(h, 6) perturbations from a pose (4, 4) near by to the fits by the frame alone."""
         return perturbation_between(base_T, self.frame[0]) + self.alone[0]
 
-    def cases(self, cam_T_grip: Array, rows: NDArray[np.intp]) -> Cases:
-        """What may be wrong with a published pose (4, 4) under the hypotheses ``rows`` (r,), by the frame alone."""
-        shift = self.alone[0] - perturbation_between(self.frame[0], cam_T_grip)
+    def bounds(self, cam_T_grip: Array, rows: NDArray[np.intp], swing: Array, risk: float) -> Bounds:
+        """The protection levels of a pose (4, 4), and of the motion since the reference, by the frame alone under the
+        hypotheses ``rows`` (r,), whatever a mount does; ``swing`` (6,): variances of its vibration.
+        """
+        shift, model = self.alone[0] - perturbation_between(self.frame[0], cam_T_grip), self.model
         of_each = shift[rows], self.covariance[rows], self.of_model[rows], self.hypotheses.prior[rows]
-        return *of_each, rows, np.zeros_like(rows)
+        cases, count, limits = (*of_each, rows, np.zeros_like(rows)), len(rows), limits_of(risk, SIGMA_INFLATION)
+        absolute = absolute_level(cases, count, *model.alike(cam_T_grip), limits)
+        first, none = model.differences(cam_T_grip, self.opened, swing), np.zeros((6, 6))
+        since = level_of_motion(cases, (0, count, count), none, first, (none, True, 0.0, 0.0), limits)
+        return Bounds(*(protection_of(each, self.hypotheses.name, risk) for each in (absolute, since)))
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""

@@ -17,9 +17,9 @@ from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
 from gripmon.model.poses import perturbation_between
-from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord, ValidBy
+from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
 from gripmon.monitor.anchor import Anchor
-from gripmon.monitor.bounds import SIGMA_INFLATION, bound_of, first_bound_of, larger, protection_of, reaching, unbounded
+from gripmon.monitor.bounds import SIGMA_INFLATION, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits, in_the_references_frames
@@ -30,7 +30,7 @@ from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Mount, bounds
-from gripmon.track.integrity.frame_kernel import Fits, absolute_level, gathered, level_of_motion
+from gripmon.track.integrity.frame_kernel import Fits, frame_bounds
 from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.integrity.separation import limits_of
@@ -283,23 +283,19 @@ class Weigher:
         if anchor is not None and not displaced:
             always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
         knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
-        cases, counts, knock, left_out = gathered(
-            cam_T_grip, displaced, fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always,
-            at_first, risk, self._least, SIGMA_INFLATION**2,
-        )  # fmt: skip
-        if left_out > 0.5 * risk:
+        of_frame = fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always, at_first, self._least
+        unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
+        moved, of_images = (False, False) if first is None else (first.knocked, first.of_images)
+        unwatched = KNOCK_UNSEEN_PROBABILITY if of_images else 0.0
+        absolute, since, knock = frame_bounds(
+            (cam_T_grip, displaced, *of_frame),
+            fits.model.alike(cam_T_grip),
+            fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro),
+            (self._usual_motion, displaced or moved, unwatched, unnoticed),
+            limits_of(risk, SIGMA_INFLATION),
+        )
+        if absolute[0] == np.inf:
             return unbounded(risk, "too much may be wrong at once"), knock
-        limits = limits_of(risk - left_out, SIGMA_INFLATION)
-        absolute = absolute_level(cases, counts[2], *fits.model.alike(cam_T_grip), limits)
-        differences = fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)
-        if first is None or differences is None:  # this frame is the first one
-            rows = np.append(np.arange(counts[1]), np.arange(counts[2], len(cases[3])))
-            since = first_bound_of(cases, limits[0], rows)
-        else:
-            unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
-            moves, unwatched = displaced or first.knocked, KNOCK_UNSEEN_PROBABILITY if first.of_images else 0.0
-            mount = self._usual_motion, moves, unwatched, unnoticed
-            since = level_of_motion(cases, counts, knock, differences, mount, limits)
         return Bounds(protection_of(absolute, names, risk), protection_of(since, names, risk)), knock
 
     @property
@@ -415,16 +411,9 @@ class Weigher:
         """Whether the protection level of a pose (4, 4) from ``fits`` is within the alert limits.  Curved and tapered
         fingers show a motion along themselves even without their ends.
         """
-        risk, count = self._policy.integrity_risk, len(fits.stays)
-        cases = fits.cases(cam_T_grip, np.arange(count))
-        if self._policy.valid_by is ValidBy.ABSOLUTE:
-            bound = bound_of(cases, risk, fits.model.alike(cam_T_grip))
-        elif (first := fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro)) is None:
-            bound = first_bound_of(cases, risk)
-        else:  # by what may be wrong now, whatever a mount does
-            counts, none, limits = (0, count, count), np.zeros((6, 6)), limits_of(risk, SIGMA_INFLATION)
-            bound = level_of_motion(cases, counts, none, first, (none, True, 0.0, 0.0), limits)
-        return past_alert_limit(protection_of(bound, fits.hypotheses.name, risk), self._policy) is None
+        risk, every = self._policy.integrity_risk, np.arange(len(fits.stays))
+        both = fits.bounds(cam_T_grip, every, self._mount.to_and_fro, risk)
+        return past_alert_limit(both.by(self._policy.valid_by), self._policy) is None
 
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""

@@ -42,7 +42,8 @@ Lasting = tuple[Fits, Array, Array, Array, Array, Ints, Array]
 
 First = tuple[Fits, Array, Array, Array, Array, Array, Array]
 """What makes fits of a pose those of the motion since the reference, as for :func:`moved`: the fits at the reference as
-:func:`begun` has them, ``lever``, ``by_motion``, ``travel``, ``origin``, ``tcp`` and ``stays_at``.
+:func:`begun` has them, none while the frame is itself the first one, ``lever``, ``by_motion``, ``travel``, ``origin``,
+``tcp`` and ``stays_at``.
 """
 
 Mount = tuple[Array, bool, float, float]
@@ -54,6 +55,9 @@ Cases = tuple[Array, Array, Array, Array, Ints, Ints]
 """What may be wrong with a published pose: the fits under it as shifts (r, 6) from that pose, covariances (r, 6, 6) and
 errors by the model (r, f, 6); ``prior`` (r,), numbers of names (r,) and of what goes with each at the reference (r,).
 """
+
+What = tuple[Array, bool, Frame, Doubted, Array, tuple[Fits, Doubted], Fits, Knocks, Lasting, Array, float]
+"""What :func:`gathered` is told of a frame, from the published pose on."""
 
 
 @compiled
@@ -152,6 +156,8 @@ def _put(fits: Fits, rows: Ints, away: Array, more: Array, prior: Array, called:
 
 @compiled
 def gathered(
+    risk: float,
+    times: float,
     cam_T_grip: Array,
     displaced: bool,
     frame: Frame,
@@ -162,9 +168,7 @@ def gathered(
     knocks: Knocks,
     lasting: Lasting,
     first_prior: Array,
-    risk: float,
     least: float,
-    times: float,
 ) -> tuple[Cases, tuple[int, int, int], Array, float]:
     """What may be wrong with a pose (4, 4): it is as known, but for one hypothesis, or was knocked away from there;
     something has been wrong all along, or was in the reference's frames alone, of the priors ``first_prior`` (g,).
@@ -269,7 +273,12 @@ def level_of_motion(
     cases: Cases, counts: tuple[int, int, int], knock: Array, first: First, mount: Mount, limits: Limits
 ) -> Bound:
     """The bound of the motion since the reference, by what is wrong now and by what may have been in its frames."""
-    (usual, moves, unwatched, unnoticed), (here, now, ever), (_, _, _, prior, _, which) = mount, counts, cases
+    (usual, moves, unwatched, unnoticed), (here, now, ever) = mount, counts
+    shift, covariance, off, prior, called, which = cases
+    if not len(first[0][0]):  # of the first frame its own errors count twice
+        rows = np.append(np.arange(now), np.arange(ever, len(prior)))
+        once_more = (shift[rows], 2.0 * covariance[rows], off[rows, :0].copy(), prior[rows], called[rows], which)
+        return absolute_level(once_more, len(rows), np.zeros((0, 6)), np.zeros(2), limits)
     # A file's tilt is by the true motion, not by what noise in fits looks like: once as of a mount that moves as usual,
     # and by all that fits show as probably as it was knocked unnoticed since the reference's frames.
     by_truth, last, none = len(first[2]) > 1 and not moves, len(prior), np.zeros((0, 6))
@@ -288,3 +297,19 @@ def level_of_motion(
     staying = usual + knock if moves else usual
     _moved(cases, ever, last, prior, first, staying, true, knock, 0.0, limits, table, names, at)
     return levels(table, names, limits)
+
+
+@compiled
+def frame_bounds(
+    what: What, alike: tuple[Array, Array], first: First, mount: Mount, limits: Limits
+) -> tuple[Bound, Bound, Array]:
+    """What :func:`absolute_level` and :func:`level_of_motion` make of what is :func:`gathered`, and the covariance
+    (6, 6) of the motion by a knock.  Both bounds are infinite where too much may be wrong at once.
+    """
+    risk, inflation, near, squares, spacing, guide, step = limits
+    cases, counts, knock, left_out = gathered(risk, inflation**2, *what)
+    if left_out > 0.5 * risk:
+        return (np.inf, np.inf, -1), (np.inf, np.inf, -1), knock
+    left = risk - left_out, inflation, near, squares, spacing, guide, step
+    absolute = absolute_level(cases, counts[2], alike[0], alike[1], left)
+    return absolute, level_of_motion(cases, counts, knock, first, mount, left), knock

@@ -124,9 +124,10 @@ def warm_up() -> None:
     doubts, frame = (some, yes, yes), (here, alone, alone, alone[1], np.eye(6))
     bare, knocks, before = (alone, doubts), (none[:3], 0, 1.0, 0.1, 0.1), (at, np.eye(6), alone[2][0])
     lasting, limits = (alone, here, here, np.eye(6), none, edge, some), limits_of(1e-5, 1.0)
-    cases, counts, knock, _ = frame_kernel.gathered(
-        here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-5, 1e-9, 1.0
-    )  # fmt: skip
-    frame_kernel.absolute_level(cases, 2, np.zeros((0, 6)), np.zeros(2), limits)
     first, mount = (begun, lever, np.zeros((0, 6, 3)), none, moved, tcp, unmoved), (np.eye(6), False, 0.0, 0.1)
-    frame_kernel.level_of_motion(cases, counts, knock, first, mount, limits)
+    alike = np.zeros((0, 6)), np.zeros(2)
+    what = here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-9
+    frame_kernel.frame_bounds(what, alike, first, mount, limits)
+    cases = *alone, some, edge, edge
+    frame_kernel.absolute_level(cases, 2, *alike, limits)
+    frame_kernel.level_of_motion(cases, (0, 2, 2), np.eye(6), first, mount, limits)

@@ -360,8 +360,8 @@ def telling(
 
 
 def gathered(
-    cam_T_grip: Array, displaced: bool, frame: tuple, doubts: tuple, solved: Array, bare: tuple, known: tuple,
-    of_knocks: tuple, lasting: tuple, first_prior: Array, _risk: float, least: float, times: float,
+    _risk: float, times: float, cam_T_grip: Array, displaced: bool, frame: tuple, doubts: tuple, solved: Array,
+    bare: tuple, known: tuple, of_knocks: tuple, lasting: tuple, first_prior: Array, least: float,
 ) -> tuple[tuple, tuple[int, int, int], Array, float]:  # fmt: skip
     fit_T, alone, anchored, covariance, floor = frame
     axis, ends, cosine, *odds = of_knocks
@@ -418,6 +418,10 @@ def level_of_motion(
     """Set by set."""
     shift, covariance, off, prior, called, which = cases
     (usual, moves, unwatched, unnoticed), (here, now, ever), none = mount, counts, np.zeros((0, 6))
+    if not len(first[0][0]):
+        kept = ~np.isin(np.arange(len(prior)), range(now, ever))
+        twice = shift[kept], 2.0 * covariance[kept], 0.0 * off[kept], prior[kept], called[kept], which[kept]
+        return absolute_level(twice, int(kept.sum()), none, np.zeros(2), limits)
     by_truth, lasts, at_once = len(first[2]) > 1 and not moves, np.arange(ever, len(prior)), np.arange(here)
     true = usual if by_truth else none
     # Which cases, their priors, and of the motion: what is known of it, and what of the true one.
@@ -434,3 +438,13 @@ def level_of_motion(
         moved(*of, spread, odds, limits[1], limits[0] / max(len(names), 1), table, at)
         at += len(rows)
     return levels(table, names, limits)
+
+
+def frame_bounds(what: tuple, alike: tuple, first: tuple, mount: tuple, limits: tuple) -> tuple:
+    risk, inflation, *tables = limits
+    cases, counts, knock, left_out = gathered(risk, inflation**2, *what)
+    if left_out > 0.5 * risk:
+        return (np.inf, np.inf, -1), (np.inf, np.inf, -1), knock
+    left = risk - left_out, inflation, *tables
+    absolute = absolute_level(cases, counts[2], *alike, left)
+    return absolute, level_of_motion(cases, counts, knock, first, mount, left), knock
