@@ -11,8 +11,9 @@ from gripmon.model.staying import Edges, edges_that_stay
 from gripmon.teach.beyond import Background, is_outermost
 from gripmon.teach.image_outline import _displaced, _moved_back
 from gripmon.teach.matte import Matte
+from gripmon.teach.piece_lines import PieceLine
 from gripmon.teach.silhouette import Stations, Transitions, from_ideal_px
-from gripmon.teach.straight_pieces import _joined, _Line
+from gripmon.teach.straight_pieces import _joined
 
 
 def test_a_turned_image_is_moved_back_wherever_its_outline_shows() -> None:
@@ -97,7 +98,7 @@ def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() ->
         way = (end[1] - end[0]) / np.linalg.norm(end[1] - end[0])
         normal = np.array([-way[1], way[0]])
         distance = float(normal @ end[0])
-        lines.append(_Line(normal, distance, np.tile(normal, (5, 1)), np.full(5, distance), 0.05, end))
+        lines.append(PieceLine(normal, distance, np.tile(normal, (5, 1)), np.full(5, distance), 0.05, end))
     chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
     assert not chain.corner.any()
     assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01

@@ -17,6 +17,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.piece_lines import LEAST_SCATTER_PX, STRAIGHT_PX
 from gripmon.teach.silhouette import (
     Stations,
     from_ideal_px,
@@ -25,7 +26,6 @@ from gripmon.teach.silhouette import (
     measure_transitions,
     to_ideal_px,
 )
-from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, STRAIGHT_PX
 
 ON_A_PIECE = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
 """Fractions of its length at which a piece, the least-squares line through a stretch of a curve, crosses the curve:

@@ -19,7 +19,7 @@ from gripmon.teach.finger_depth import PlacedOutlines, leaves_smoothly, nearest_
 from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import FingerSeen, OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
-from gripmon.teach.straight_pieces import jackknife_sigma
+from gripmon.teach.piece_lines import jackknife_sigma
 from gripmon.teach.vanishing import PARALLEL_RAD, Outline
 from gripmon.track.edges.roles import PARALLEL_COSINE
 

@@ -19,8 +19,9 @@ from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsE
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
 from gripmon.teach.matte import FEWEST_IMAGES, Matte, find_matte
+from gripmon.teach.piece_lines import STRAIGHT_PX
 from gripmon.teach.silhouette import Stations, Transitions, measure_transitions, stations_along, trace
-from gripmon.teach.straight_pieces import STRAIGHT_PX, Chain, fit_chains, runs, without_outliers
+from gripmon.teach.straight_pieces import Chain, fit_chains, runs, without_outliers
 
 _BESIDE_PX = 9.0
 """How far beside a part another one counts as joined to it: a search line's reach."""

@@ -16,7 +16,7 @@ from gripmon.model.records import Array
 from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.image_model import tip_width
 from gripmon.teach.motion_depth import Moved
-from gripmon.teach.straight_pieces import STRAIGHT_PX
+from gripmon.teach.piece_lines import STRAIGHT_PX
 
 Length = tuple[float, float]
 """A length and its standard deviation, m."""

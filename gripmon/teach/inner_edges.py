@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 from gripmon.teach.matte import Matte
+from gripmon.teach.piece_lines import jackknife_sigma
 from gripmon.teach.silhouette import folds_of, from_ideal_px, to_ideal_px
-from gripmon.teach.straight_pieces import jackknife_sigma
 
 SHORTEST_PX = 20.0
 """Least length of an edge: texture has shorter lines, scratches and brush marks."""

@@ -32,8 +32,9 @@ from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_unknowns import STATIONS, Jaws
+from gripmon.teach.piece_lines import LEAST_SCATTER_PX, STRAIGHT_PX
 from gripmon.teach.silhouette import FROM_BORDER_PX, Stations, in_image, lines_in_image, measure_transitions
-from gripmon.teach.straight_pieces import LEAST_SCATTER_PX, LONGEST_CUT_PX, STRAIGHT_PX
+from gripmon.teach.straight_pieces import LONGEST_CUT_PX
 from gripmon.teach.vanishing import Outline
 
 MORE_CHI2 = 9.0
