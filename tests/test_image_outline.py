@@ -102,3 +102,15 @@ def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() ->
     chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
     assert not chain.corner.any()
     assert np.abs(chain.uv_px[1] - from_ideal_px(CAMERA, a[None])[0]).max() < 0.01
+
+
+def test_pieces_that_pass_each_other_at_a_step_go_on_as_far_as_it_does() -> None:
+    """Halfway across a step of 5 px the vertex would lie 2.5 px beside both."""
+    lines, ends = [], [np.array([[0.0, 0.0], [50.0, 0.0]]), np.array([[53.0, 5.0], [90.0, 5.0]])]
+    for end in ends:
+        normal, distance = np.array([0.0, 1.0]), float(end[0, 1])
+        lines.append(PieceLine(normal, distance, np.tile(normal, (5, 1)), np.full(5, distance), 0.05, end))
+    chain = _joined(CAMERA, np.vstack(ends), lines, [(0, 1), (2, 3)], closed=False)
+    assert not chain.corner.any()
+    at = np.array([[0.0, 0.0], [51.5, 0.0], [51.5, 5.0], [90.0, 5.0]])
+    assert np.abs(chain.uv_px - from_ideal_px(CAMERA, at)).max() < 0.01

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.teach.beyond import Background
+from gripmon.teach.beyond import WITHIN_PX, Background
 from gripmon.teach.piece_lines import (
     LEAST_SCATTER_PX,
     SHORTEST_PIECE_PX,
@@ -47,9 +47,9 @@ _MOST_POINTS = 1500
 @dataclass(frozen=True)
 class Chain:
     """Consecutive vertices ``uv_px`` (v, 2) in the image, ``closed`` or from end to end.  ``folds_px`` (f, v, 2): the
-    same with one tenth of the images left out; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px``
-    (pieces,) scatter about each piece, ``sigma_px`` (v,) of a vertex.  Going along the chain the gripper is on the left
-    in the image.
+    same with one tenth of the images left out; ``corner`` (v,): whether two pieces meet at an angle; ``rms_px`` (m,)
+    scatter about each measured piece, which steps from one to the next aren't; ``sigma_px`` (v,) of a vertex.  Going
+    along the chain the gripper is on the left in the image.
     """
 
     uv_px: Array
@@ -188,7 +188,9 @@ def fit_chains(
     def joined(before: _Found, after: _Found) -> bool:
         (_, one), (_, other) = before, after
         ends = one.ends[1], other.ends[0]
-        if float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX and _is_smooth(before, after, ideal):
+        near = float(np.linalg.norm(ends[1] - ends[0])) <= _GAP_PX
+        # A step between them as long as a piece would be one.
+        if near and _is_smooth(before, after, ideal) and _apart_px(one, other) < SHORTEST_PIECE_PX:
             return True
         # What lies between is a corner that the smoothed contour cut off, if both edges go on until they meet.
         distances = np.array([[one.distance], [other.distance]])
@@ -305,8 +307,10 @@ def _joined(camera: Camera, ideal: Array, lines: list[PieceLine], spans: list[tu
         feet = [foot_on(normals[i], distances[i], joint) for i in (a, b)]
         share = float(np.clip((met[0] - lines[a].ends[1]) @ gap / max(float(gap @ gap), 1e-9), 0.0, 1.0))
         near = np.linalg.norm(met[0] - lines[a].ends[1] - share * gap) < 2.0
-        vertices.append(met if near else 0.5 * (feet[0] + feet[1]))
-        corner.append(False)
+        # Where they pass each other at a step that is farther beside both than an outline may be: each goes on to it.
+        step = not near and 0.5 * _apart_px(lines[a], lines[b]) > WITHIN_PX
+        vertices += [met] if near else feet if step else [0.5 * (feet[0] + feet[1])]
+        corner += [False] * (1 + step)
     if not closed:
         vertices.append(foot_on(normals[-1], distances[-1], lines[-1].ends[1]))
         corner.append(False)
@@ -322,6 +326,13 @@ def _is_smooth(before: _Found, after: _Found, ideal: Array) -> bool:
     """Whether two pieces approximate a curve, instead of meeting in a corner."""
     shorter_px = min(float(np.linalg.norm(ideal[last] - ideal[first])) for (first, last), _ in (before, after))
     return shorter_px * _turn(before[1].normal, after[1].normal) / 8.0 <= CORNER_SAG_PX
+
+
+def _apart_px(one: PieceLine, other: PieceLine) -> float:
+    """How far apart the lines of two adjacent pieces are halfway between their ends."""
+    joint = 0.5 * (one.ends[1] + other.ends[0])
+    feet = [foot_on(line.normal[None], np.array([line.distance]), joint)[0] for line in (one, other)]
+    return float(np.linalg.norm(feet[1] - feet[0]))
 
 
 def _turn(a: Array, b: Array) -> float:
