@@ -95,15 +95,6 @@ def test_a_gripper_that_stands_elsewhere_unproven_is_told_with_its_way(protectio
     assert kinds(run.feed_all([seen(where_it_was=True, believed=False)] * 4)) == [(K.OCCLUDED, CLEARED)]
 
 
-@pytest.mark.parametrize(("elsewhere", "told"), [(True, 0), (False, 1)], ids=["elsewhere", "ends unseen"])
-def test_a_fault_of_the_gripper_speaks_for_a_place_elsewhere_but_not_for_ends_that_nothing_shows(elsewhere, told):
-    run = settled()
-    doubted = seen(protection=BOUNDED if elsewhere else BEYOND, unproven=True, believed=not elsewhere, explanation=BENT)
-    alerts = alerts_of(run.feed_all([doubted] * (round(SETTINGS.hold_s / PERIOD_S) + 1)))
-    assert K.GRIPPER in {alert.kind for alert in alerts}
-    assert sum(alert.kind is K.OCCLUDED for alert in alerts) == told
-
-
 def test_hidden_fingers_that_show_without_their_ends_are_told_as_that():
     """What was said of an older frame doesn't hold: edges are seen again, and they prove nothing."""
     run, doubted = settled(), seen(protection=BEYOND, unproven=True)

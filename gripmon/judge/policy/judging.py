@@ -87,11 +87,8 @@ class Evidence:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image, nor with
-        a fault of gripper or lens, which has an alert of its own.
-        """
-        faulty = self.explanation.confirmed_cause.cause in NOT_THE_CAMERA
-        return not (self.believed or self.where_it_was or self.old or faulty)
+        """Whether the gripper is seen where it wasn't, and may not be taken to be there; not in an old image."""
+        return not (self.believed or self.where_it_was or self.old)
 
     @property
     def moved(self) -> bool:
@@ -152,7 +149,9 @@ class Policy:
         self.state = state
         beyond = past_alert_limit(evidence.protection, settings)
         reason = self._doubt(evidence, confirmed, beyond)
-        if not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
+        # A fault of the gripper or the lens has an alert of its own, and nothing proves a place with it.
+        faulty = evidence.explanation.confirmed_cause.cause in NOT_THE_CAMERA
+        if faulty or not (evidence.elsewhere or (evidence.unproven and beyond is not None)):
             self._unproven_since = None
         elif self._unproven_since is None:
             self._unproven_since, self._unproven_text = (now_s, stamp_ns), ""
