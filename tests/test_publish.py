@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import threading
 import time
 from pathlib import Path
@@ -204,6 +205,8 @@ def test_bad_settings_name_their_key(changes: dict[str, object], text: str):
         Published(PublishSettings(**changes), "arm", "wrist")  # type: ignore[arg-type]
     assert str(caught.value).startswith(text)
     assert "\n" not in str(caught.value) and ".rs:" not in str(caught.value)
+    elsewhere = pickle.loads(pickle.dumps(caught.value))  # as a process pool sends it
+    assert (str(elsewhere), elsewhere.key) == (str(caught.value), caught.value.key)
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "a*", "$x", "a#b", "a?b", "@adv", "a b", "a\n"])
