@@ -175,8 +175,8 @@ class Weigher:
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
-        knocked = self._knocked(now_s)
-        odds = knocked, 1.0 if may_have_slid else max(knocked, KNOCK_UNSEEN_PROBABILITY)
+        shown, hidden = self._knocked(now_s)
+        odds = shown, 1.0 if may_have_slid else hidden
         besides = odds[1] * prior[hypotheses.ends]
         unsettled = displaced or not self.proved
         without = self._without_ends(fits, besides, unsettled)
@@ -387,13 +387,14 @@ class Weigher:
             *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
 
-    def _knocked(self, now_s: float) -> float:
+    def _knocked(self, now_s: float) -> tuple[float, float]:
         """Probability that the mount was knocked since the pose was last proven, or since the reference's images, if
-        nothing hides what would show it.
+        nothing hides what would show it, and if something does.
         """
         if self.anchor is None:
-            return KNOCK_UNSEEN_PROBABILITY
-        return self._mount.knocked(now_s - self.anchor.now_s, hidden=False)
+            return KNOCK_UNSEEN_PROBABILITY, KNOCK_UNSEEN_PROBABILITY
+        shown = self._mount.knocked(now_s - self.anchor.now_s, hidden=False)
+        return shown, max(shown, KNOCK_UNSEEN_PROBABILITY)
 
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """See :meth:`EndsEvidence.confirmations`."""
@@ -403,8 +404,7 @@ class Weigher:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
-        knocked = max(self._knocked(now_s), KNOCK_UNSEEN_PROBABILITY)
-        excluded = knocked * self._ends.sides_misread(measurement)
+        excluded = self._knocked(now_s)[1] * self._ends.sides_misread(measurement)
         return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:

@@ -308,7 +308,7 @@ def _joined(camera: Camera, ideal: Array, lines: list[PieceLine], spans: list[tu
         share = float(np.clip((met[0] - lines[a].ends[1]) @ gap / max(float(gap @ gap), 1e-9), 0.0, 1.0))
         near = np.linalg.norm(met[0] - lines[a].ends[1] - share * gap) < 2.0
         # Where they pass each other at a step that is farther beside both than an outline may be: each goes on to it.
-        step = not near and 0.5 * _apart_px(lines[a], lines[b]) > WITHIN_PX
+        step = not near and 0.5 * float(np.linalg.norm(feet[1][0] - feet[0][0])) > WITHIN_PX
         vertices += [met] if near else feet if step else [0.5 * (feet[0] + feet[1])]
         corner += [False] * (1 + step)
     if not closed:
