@@ -15,7 +15,7 @@ from support.daemon_bench import Bench
 
 from gripmon.io.sources.realtime import SimulatedCamera
 from gripmon.model.records import Frame
-from gripmon.model.stopping import StopRequest, signals_exit
+from gripmon.model.stopping import StopRequest, interrupts_kept, signals_exit
 
 HERE = Path(__file__).resolve().parent
 
@@ -40,6 +40,16 @@ def test_one_that_python_drops_during_the_start_up_ends_the_loop_at_once(number:
         assert bench.run(stop=stop) == code
     assert bench.network.transforms == []
     assert bench.source.closed and bench.network.closed and bench.recording.closed
+
+
+def test_one_that_python_drops_interrupts_a_command_a_moment_later():
+    """As `replay` did: it went on to its end, exit code 0."""
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+        dying = Dying(signal.SIGINT)
+        del dying  # nothing is raised here
+        time.sleep(30.0)
+    assert sys.unraisablehook is before
 
 
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon import __version__
 from gripmon.model.errors import InputError, NoResultError
-from gripmon.model.stopping import EXIT_INTERRUPTED
+from gripmon.model.stopping import EXIT_INTERRUPTED, interrupts_kept
 
 if TYPE_CHECKING:
     from gripmon.cli.common import Arguments, Command
@@ -228,7 +228,8 @@ def _run(words: list[str]) -> int:
         os.environ.setdefault(variable, value)
     command: Command = chosen.command
     try:
-        return command.run(chosen)
+        with interrupts_kept():
+            return command.run(chosen)
     except (InputError, NoResultError) as error:
         print(_in_words(error, chosen), file=sys.stderr)
         return error.exit_code

@@ -5,12 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
 EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED = 0, 3, 130
+
+_AGAIN_S = 0.01
+"""Seconds after which a dropped interrupt is raised again: destructors take less, and nobody waits that notices."""
 
 _Handler = Callable[[int, FrameType | None], None]
 
@@ -44,6 +48,30 @@ def signals_exit() -> Iterator[StopRequest]:
 
     with _handling(handle):
         yield stop
+
+
+@contextlib.contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """For a command that polls nothing: a KeyboardInterrupt that Python drops, because it was raised while a destructor
+    or a weak reference's callback ran, is raised once more a moment later.
+    """
+    former, waiting = sys.unraisablehook, list[threading.Timer]()
+
+    def again(dropped: sys.UnraisableHookArgs) -> None:
+        if dropped.exc_type is not KeyboardInterrupt:
+            former(dropped)
+            return
+        # Later, and from a thread: here it would be dropped as well.
+        waiting.append(threading.Timer(_AGAIN_S, signal.raise_signal, (signal.SIGINT,)))
+        waiting[-1].start()
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = former
+        for timer in waiting:
+            timer.cancel()
 
 
 @contextlib.contextmanager
