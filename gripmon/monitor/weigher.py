@@ -31,7 +31,6 @@ from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Mount, bounds
 from gripmon.track.integrity.frame_kernel import Fits, frame_bounds
-from gripmon.track.integrity.hypotheses import WRONG_EDGE
 from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.integrity.separation import limits_of
 from gripmon.track.look import ONE_EDGE_PX
@@ -46,6 +45,11 @@ exceeds it in one of a thousand knocks, which is then accepted a frame later.
 
 LEAST_WEIGHT_RATIO = 1e-3
 """Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
+
+BESIDES_RATIO = 0.1
+"""The same of all knocks together where the ends and something else are something else: a tenth of the risk makes a
+normal error's bound half a percent larger.
+"""
 
 
 class Weigher:
@@ -179,8 +183,8 @@ class Weigher:
         odds = shown, 1.0 if may_have_slid else hidden
         besides = odds[1] * prior[hypotheses.ends]
         unsettled = displaced or not self.proved
-        without = self._without_ends(fits, besides, unsettled)
-        both, knock = self._bounds(fits, without, prior, odds, cam_T_grip, displaced)
+        without, unsolved = self._without_ends(fits, besides, unsettled)
+        both, knock = self._bounds(fits, without, unsolved, prior, odds, cam_T_grip, displaced)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = without if without is not None and not proven and unsettled else fits
@@ -255,6 +259,7 @@ class Weigher:
         self,
         fits: Refits,
         without: Refits | None,
+        unsolved: float,
         prior: Array,
         odds: tuple[float, float],
         cam_T_grip: Array,
@@ -262,9 +267,9 @@ class Weigher:
     ) -> tuple[Bounds, Array]:
         """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
         is as known, and after the knocks that the mount may have got since, by the fits and by those ``without`` ends,
-        with what may have been wrong all along, or in the reference's frames alone.  ``prior`` (h,): of the
-        hypotheses; ``odds``: of a knock that the ends show, and of one that only they would.  And how far a knock moves
-        the mount, (6, 6).
+        with what may have been wrong all along, or in the reference's frames alone.  ``unsolved``: probability of what
+        isn't solved; ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only
+        they would.  And how far a knock moves the mount, (6, 6).
         """
         anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
         every, (shift, covariance, of_model), risk = fits.hypotheses, fits.alone, self._policy.integrity_risk
@@ -283,7 +288,7 @@ class Weigher:
         if anchor is not None and not displaced:
             always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
         knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
-        of_frame = fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always, at_first, self._least
+        of_frame = fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always, at_first, self._least, unsolved
         unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
         moved, of_images = (False, False) if first is None else (first.knocked, first.of_images)
         unwatched = KNOCK_UNSEEN_PROBABILITY if of_images else 0.0
@@ -314,16 +319,20 @@ class Weigher:
         covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
         return _contradicts(way, covariance)
 
-    def _without_ends(self, fits: Refits, besides: float, unsettled: bool) -> Refits | None:
-        """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that, of the
-        probability ``besides``, doesn't count.  ``unsettled``: of a pose that is displaced, or before one is proved.
+    def _without_ends(self, fits: Refits, besides: float, unsettled: bool) -> tuple[Refits | None, float]:
+        """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that counts
+        little, a knock being of the probability ``besides`` then; and the probability of what isn't solved for that.
+        ``unsettled``: of a pose that is displaced, or before one is proved.
         """
         if not fits.hypotheses.across.any():
-            return fits
+            return fits, 0.0
         about = self._possible.about(fits.edges)
         if unsettled:
-            return fits.under(about.without_ends)
-        return None if besides * WRONG_EDGE <= self._least else fits.under(about.pairs)
+            return fits.under(about.without_ends), 0.0
+        together = besides * about.pairs.of_more_than_ends
+        if together <= BESIDES_RATIO * self._policy.integrity_risk:
+            return None, together
+        return fits.under(about.pairs), 0.0
 
     def settle(
         self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float

@@ -56,7 +56,7 @@ Cases = tuple[Array, Array, Array, Array, Ints, Ints]
 errors by the model (r, f, 6); ``prior`` (r,), numbers of names (r,) and of what goes with each at the reference (r,).
 """
 
-What = tuple[Array, bool, Frame, Doubted, Array, tuple[Fits, Doubted], Fits, Knocks, Lasting, Array, float]
+What = tuple[Array, bool, Frame, Doubted, Array, tuple[Fits, Doubted], Fits, Knocks, Lasting, Array, float, float]
 """What :func:`gathered` is told of a frame, from the published pose on."""
 
 
@@ -169,13 +169,15 @@ def gathered(
     lasting: Lasting,
     first_prior: Array,
     least: float,
+    unsolved: float,
 ) -> tuple[Cases, tuple[int, int, int], Array, float]:
     """What may be wrong with a pose (4, 4): it is as known, but for one hypothesis, or was knocked away from there;
     something has been wrong all along, or was in the reference's frames alone, of the priors ``first_prior`` (g,).
 
     ``solved`` (h,): the priors as they count for knocks; ``bare``: fits and doubts where no end is what it seems
     besides; ``known``: the pose before, with its covariance and its errors by the model.  Knocks of less probability
-    than ``least`` aren't solved; ``times``: factor on the fits' covariances for their tails.
+    than ``least`` aren't solved, nor is something of the probability ``unsolved``; ``times``: factor on the fits'
+    covariances for their tails.
 
     Returns the cases, in this order, and the numbers up to which the first, second and third are, these with the
     anchor's origin; the same without it come before the last.  Names count from those of the hypotheses over the same
@@ -195,7 +197,7 @@ def gathered(
         bare_shift, bare_own, bare_off, place, before, known_off, jumps, share, along, bare_doubts[0], seen, unseen,
         bare_doubts[1], bare_doubts[2], least, times,
     )  # fmt: skip
-    left_out += bare_left_out
+    left_out += bare_left_out + unsolved
     here, g, h, b, many = np.flatnonzero(stays), len(rows), len(prior), len(bare_shift), len(first_prior)
     count = len(here) + len(fit) + len(bare_fit) + 2 * g + max(many - 1, 0)
     every, nowhere, nothing = np.arange(count), np.zeros(6), np.zeros((6, 6))

@@ -53,6 +53,11 @@ class Hypotheses:
         """(h,) which doubt something else than the ends."""
         return np.asarray((self.keep[:, ~self.across] == 0.0).any(axis=1) | self.opening)
 
+    @cached_property
+    def of_more_than_ends(self) -> float:
+        """The sum of the priors of these."""
+        return float(self.prior[self.more_than_ends].sum())
+
     def without_ends(self) -> Hypotheses:
         """The same where no end of a finger is what it seems besides."""
         name = tuple(f"{name}, and what looks like ends" for name in self.name)

@@ -126,7 +126,7 @@ def warm_up() -> None:
     lasting, limits = (alone, here, here, np.eye(6), none, edge, some), limits_of(1e-5, 1.0)
     first, mount = (begun, lever, np.zeros((0, 6, 3)), none, moved, tcp, unmoved), (np.eye(6), False, 0.0, 0.1)
     alike = np.zeros((0, 6)), np.zeros(2)
-    what = here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-9
+    what = here, False, frame, doubts, some, bare, before, knocks, lasting, some, 1e-9, 0.0
     frame_kernel.frame_bounds(what, alike, first, mount, limits)
     cases = *alone, some, edge, edge
     frame_kernel.absolute_level(cases, 2, *alike, limits)
