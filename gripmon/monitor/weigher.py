@@ -326,7 +326,7 @@ class Weigher:
         """
         if not fits.hypotheses.across.any():
             return fits, 0.0
-        about = self._possible.about(fits.edges)
+        about = self._possible.about(fits.edges, fits.doubtful)
         if unsettled:
             return fits.under(about.without_ends), 0.0
         together = besides * about.pairs.of_more_than_ends
@@ -449,7 +449,7 @@ class Weigher:
             wander = self._wander(now_s)
             known = Known(expected_T, covariance + np.diag(wander), of_model, wander)
             model = self._possible.model._replace(first=self._since.published_by)
-            hypotheses = self._possible.about(measurement.normal.edge).hypotheses
+            hypotheses = self._possible.about(measurement.normal.edge, measurement.doubtful).hypotheses
             floor = self._tracker.floor_of(measurement)
             self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]
