@@ -81,7 +81,7 @@ def test_before_anything_is_proven_a_place_can_be_asked_for_its_sides():
     )  # fmt: skip
     frame, weigher = Frame(0, 0, picture(SCENE, 0), 0.034), monitor._trust._weigher
     measurement = monitor._tracker.measure_held(frame, nominal_cam_T_grip(), np.full(6, 1e-3))
-    assert weigher.anchor is None and weigher.held_across(measurement, 0.0)
+    assert weigher.place.anchor is None and weigher.held_across(measurement, 0.0)
 
 
 def covariance_of(record: FrameRecord) -> np.ndarray:

@@ -44,11 +44,15 @@ def test_one_that_python_drops_during_the_start_up_ends_the_loop_at_once(number:
 
 def test_one_that_python_drops_interrupts_a_command_a_moment_later():
     """As `replay` did: it went on to its end, exit code 0."""
-    before = sys.unraisablehook
-    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+
+    def work() -> None:
         dying = Dying(signal.SIGINT)
         del dying  # nothing is raised here
         time.sleep(30.0)
+
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+        work()
     assert sys.unraisablehook is before
 
 

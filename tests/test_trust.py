@@ -328,9 +328,9 @@ def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
             record = monitor.process(frame)
         assert record.verdict is Verdict.VALID, "in free view each frame proves itself"
         measurement, weigher = monitor._newest, monitor._trust._weigher
-        assert measurement is not None and weigher.anchor is not None
+        assert measurement is not None and weigher.place.anchor is not None
         for later_s in (0.0, 1.0):
-            trust = weigher.weigh(measurement, monitor._cam_T_grip, half, weigher.anchor.now_s + later_s)
+            trust = weigher.weigh(measurement, monitor._cam_T_grip, half, weigher.place.anchor.now_s + later_s)
             assert not (trust.proven or trust.displaced)
             bound_m[rate, later_s] = trust.bounds.absolute.position_m
     limit_m = PolicySettings().alert_limit_m
@@ -344,11 +344,11 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     for frame in frames_of(scene(BEGINS))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.anchor is not None
+    assert measurement is not None and weigher.place.anchor is not None
     normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
     near = np.array([along[edge] or names[edge] in ("L_tip_near", "R_tip_near") for edge in normal.edge])
     on_one_line = replace(normal, **{part.name: getattr(normal, part.name)[near] for part in fields(normal)})
-    limit_m, at_s = PolicySettings().alert_limit_m, weigher.anchor.now_s
+    limit_m, at_s = PolicySettings().alert_limit_m, weigher.place.anchor.now_s
     for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
         ends, seen = FingerEndsSeen(*map(np.array, (corners, [3, 3], corners))), replace(measurement, normal=sides_and)
         assert weigher._ends.misread(seen, ends) == pytest.approx(MISREAD_PROBABILITY**times)
@@ -377,13 +377,13 @@ def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_tha
     for frame in frames_of(scene(BEGINS))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.anchor is not None
+    assert measurement is not None and weigher.place.anchor is not None
     seen, along = measurement.consensus.edge_seen, monitor._tracker.along
     sides = np.flatnonzero(seen & along)[:2]
     of_two = replace(measurement, normal=replace(measurement.normal, edge=sides))
     month_s = 365.25 / 12 * 86400.0
-    assert weigher.held_across(of_two, weigher.anchor.now_s + 0.9e-3 * month_s)
-    assert not weigher.held_across(of_two, weigher.anchor.now_s + 1.1e-3 * month_s)
+    assert weigher.held_across(of_two, weigher.place.anchor.now_s + 0.9e-3 * month_s)
+    assert not weigher.held_across(of_two, weigher.place.anchor.now_s + 1.1e-3 * month_s)
 
 
 def test_where_too_few_search_lines_agree_one_edge_does_not_show_a_knock_along_the_fingers():
@@ -394,12 +394,13 @@ def test_where_too_few_search_lines_agree_one_edge_does_not_show_a_knock_along_t
     for frame in frames_of(scene(BEGINS))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.anchor is not None
+    assert measurement is not None and weigher.place.anchor is not None
     normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
     edges = normal.edge.tolist()
     seen = np.array([(along[edge] and names[edge][0] == "R") or names[edge] == "L_tip_near" for edge in edges])
-    few = replace(measurement, normal=replace(normal, **{p.name: getattr(normal, p.name)[seen] for p in fields(normal)}))
-    at = monitor._cam_T_grip, FingerEndsSeen(*map(np.array, ([0, 0], [3, 3], [0, 0]))), weigher.anchor.now_s
+    of_few = {part.name: getattr(normal, part.name)[seen] for part in fields(normal)}
+    few = replace(measurement, normal=replace(normal, **of_few))
+    at = monitor._cam_T_grip, FingerEndsSeen(*map(np.array, ([0, 0], [3, 3], [0, 0]))), weigher.place.anchor.now_s
     agreed, doubtful = weigher.weigh(few, *at), weigher.weigh(replace(few, doubtful=True), *at)
     level, less = agreed.bounds.absolute, doubtful.bounds.absolute
     assert less.position_m > 1.5 * level.position_m and less.hypothesis.endswith("belongs to something else")
@@ -502,10 +503,10 @@ def test_ends_that_are_seen_where_the_fingers_have_slid_from_prove_nothing():
     for frame in frames_of(scene(BEGINS))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.anchor is not None
+    assert measurement is not None and weigher.place.anchor is not None
     every = FingerEndsSeen(*3 * [np.array([3, 3])])
     proven, slid = (
-        weigher.weigh(measurement, monitor._cam_T_grip, every, weigher.anchor.now_s, slid=slid)
+        weigher.weigh(measurement, monitor._cam_T_grip, every, weigher.place.anchor.now_s, slid=slid)
         for slid in (False, True)
     )
     assert proven.proven and not slid.proven
@@ -522,7 +523,7 @@ def test_how_many_corners_prove_a_pose_elsewhere(monkeypatch: pytest.MonkeyPatch
     for frame in frames_of(scene(BEGINS + 3, mount=(along_fingers(3e-3, BEGINS_S),)))[0]:
         monitor.process(frame)
     measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.anchor is not None
+    assert measurement is not None and weigher.place.anchor is not None
     for corners, strictly, seen_along, proven in (
         ([2, 2], [0, 0], False, True),
         ([2, 1], [1, 0], True, True),
@@ -534,7 +535,7 @@ def test_how_many_corners_prove_a_pose_elsewhere(monkeypatch: pytest.MonkeyPatch
         ([2, 0], [2, 0], True, False),
     ):
         ends = FingerEndsSeen(np.array(corners), np.array([3, 3]), np.array(strictly))
-        trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.anchor.now_s, seen_along=seen_along)
+        trust = weigher.weigh(measurement, monitor._cam_T_grip, ends, weigher.place.anchor.now_s, seen_along=seen_along)
         assert trust.displaced and trust.proven == proven, (corners, strictly, seen_along)
 
 

@@ -94,13 +94,13 @@ def test_tapered_fingers_need_ends_where_one_more_wrong_edge_leaves_too_little()
     """Their four sides tell all six unknowns, but three of them don't."""
     monitor, measurement = knocked_tapered_fingers()
     weigher = monitor._trust._weigher
-    assert weigher.anchor is not None
+    assert weigher.place.anchor is not None
     sides = monitor._tracker.along[measurement.normal.edge]
     others = [sides & (np.arange(len(sides)) != k) for k in np.flatnonzero(sides)]
     worst_m, limit_m = max(sigma_m_of(measurement, kept) for kept in others), PolicySettings().alert_limit_m
     exceeded_once_in_a_thousand = 3.29  # standard deviations: the risk over the prior of a wrong edge
     assert exceeded_once_in_a_thousand * worst_m > limit_m > 4.42 * SIGMA_INFLATION * sigma_m_of(measurement, sides)
-    trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, weigher.anchor.now_s)
+    trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, weigher.place.anchor.now_s)
     assert trust.displaced and not trust.proven
     assert trust.bounds.absolute.position_m > MISREAD_PROBABILITY * exceeded_once_in_a_thousand * worst_m
 
@@ -116,9 +116,9 @@ def test_a_pose_that_needs_no_ends_is_remembered_without_them():
     covariance = measurement.covariance[:6, :6]
     trust = weigher.weigh(measurement, measurement.cam_T_grip, NO_END, 0.0)
     assert trust.displaced and trust.proven
-    weigher.settle(trust, measurement, measurement.cam_T_grip, covariance, 0.0)
-    assert weigher.anchor is not None
-    claimed_m = np.sqrt(np.linalg.eigvalsh(weigher.anchor.covariance[:3, :3])[-1])
+    weigher.place.settle(trust, measurement, measurement.cam_T_grip, covariance, 0.0)
+    assert weigher.place.anchor is not None
+    claimed_m = np.sqrt(np.linalg.eigvalsh(weigher.place.anchor.covariance[:3, :3])[-1])
     sides = tracker.along[measurement.normal.edge]
     assert claimed_m > 0.99 * sigma_m_of(measurement, sides) > 1.2 * sigma_m_of(measurement, np.ones_like(sides))
 
@@ -421,6 +421,6 @@ def test_of_a_lone_finger_that_may_have_slid_along_itself_no_look_is_learnt(away
     monitor = Monitor(camera, gripper, MonitorSettings(), reference_of(reference_T))
     for k in range(10):
         monitor.process(simulator.frame(k))
-    anchor = monitor._trust._weigher.anchor
+    anchor = monitor._trust._weigher.place.anchor
     assert anchor is not None, "its ends were seen"
     assert monitor._trust._strips.awaited == (away_m > 0.0)

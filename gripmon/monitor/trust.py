@@ -72,6 +72,7 @@ class Integrity:
         self.since = AtReferences(reference, policy.valid_by, policy.integrity_risk, tracker.measured_as)
         """What was measured at the reference in force."""
         self._weigher = Weigher(tracker, gripper, settings, reference, self.since)
+        self._place = self._weigher.place
         unused = tracker.taught_at[0] is not None and self.since.current is None
         self.since_refused: str | None = self.taught_otherwise if unused else None
         """Why what the taught edges or a state have about the reference's frames isn't used; None where it is, or there
@@ -100,17 +101,17 @@ class Integrity:
         """(6,) by how much the first proven pose differed from the expected one, m and rad; None if it didn't, or an
         operator has said why.
         """
-        return self._weigher.unexplained
+        return self._place.unexplained
 
     @property
     def question(self) -> Question | None:
         """The same, also once it is answered."""
-        return self._weigher.question
+        return self._place.question
 
     @property
     def swing(self) -> Array:
         """(6,) variance of the vibration between proven poses, m² and rad²."""
-        return self._weigher.swing
+        return self._place.swing
 
     def refer(self, reference: ReferenceRecord) -> None:
         """Begin the motion since the reference in force."""
@@ -118,12 +119,12 @@ class Integrity:
 
     def measured_again(self, reference: ReferenceRecord) -> None:
         """A new reference, in force or proposed, was measured from the newest frames."""
-        if self._weigher.anchor is not None:
-            self.since.measured(reference, self._weigher.anchor, self._jaw_opening_m)
+        if self._place.anchor is not None:
+            self.since.measured(reference, self._place.anchor, self._jaw_opening_m)
 
     def rebase(self, reference: ReferenceRecord) -> None:
         """Expect the gripper at a new reference."""
-        self._weigher.rebase(reference)
+        self._place.rebase(reference)
 
     def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
         """Continue after a restart: from the last known pose (4, 4), with the kept strips: without them
@@ -133,8 +134,8 @@ class Integrity:
             # What an earlier run couldn't explain, a restart doesn't either.
             answered = None if state.explained_from is msgspec.UNSET else state.explained_from
             revision = state.references[-1].revision
-            self._weigher.question = Question(np.array(state.unexplained), revision, answered)
-        self._weigher.rebase(reference, last_T)
+            self._place.question = Question(np.array(state.unexplained), revision, answered)
+        self._place.rebase(reference, last_T)
         if state is not None and state.strips is not msgspec.UNSET:
             try:
                 self._strips.restore(state.strips)
@@ -156,11 +157,11 @@ class Integrity:
         """The newest pose (4, 4) if it was believed and one was proven before, else where the gripper is expected: a
         pose that nothing proved mustn't be what a restart expects.
         """
-        return cam_T_grip if self._believed and self._weigher.proved else self._weigher.expected[0]
+        return cam_T_grip if self._believed and self._place.proved else self._place.at[0]
 
     def rivals(self, ref_cam_T_grip: Array) -> tuple[Array, ...]:
         """Where else the gripper may be: at the anchor, and where the reference has it."""
-        anchor = self._weigher.anchor
+        anchor = self._place.anchor
         return (ref_cam_T_grip,) if anchor is None or not anchor.proven else (anchor.cam_T_grip, ref_cam_T_grip)
 
     def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
@@ -238,7 +239,7 @@ class Integrity:
         """
         weigher = self._weigher
         displaced = weigher.displaced(measurement, now_s)
-        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen or displaced or not weigher.proved
+        due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen or displaced or not self._place.proved
         self._frames += 1
         if not due:
             trust = weigher.weigh(measurement, cam_T_grip, None, now_s)
@@ -258,7 +259,7 @@ class Integrity:
         if along.slide_m is not None:
             slid_T = cam_T_grip.copy()
             slid_T[:3, 3] += cam_T_grip[:3, :3] @ along.slide_m
-            again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
+            again = self._measured(frame, slid_T, self._place.sigma(now_s), now_s)
             if again is not None and again.along.slide_m is None:
                 return again
         elif not along.undecided:
@@ -267,7 +268,7 @@ class Integrity:
 
     def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
         """How far the edges show from where the gripper is expected, px."""
-        return measurement.prediction.moved_px(perturbation_between(self._weigher.expected[0], cam_T_grip))
+        return measurement.prediction.moved_px(perturbation_between(self._place.at[0], cam_T_grip))
 
     def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
         """Decide between a displaced pose and the expected place.  The proven one is published; where both or neither
@@ -293,7 +294,7 @@ class Integrity:
         too little is seen there, where neither the fingers' ends nor their strips show it, since what hides them may
         look like edges of theirs, or where the bound is past an alert limit.
         """
-        there = None if not self._weigher.proved else self._at_its_place(frame, now_s)
+        there = None if not self._place.proved else self._at_its_place(frame, now_s)
         if there is None:
             return None
         standing = self._conclude(frame, there, now_s)
@@ -305,7 +306,7 @@ class Integrity:
         beside them look like ends elsewhere.  None where that is excluded, or too little of the sides is seen.
         """
         weigher = self._weigher
-        there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
+        there = self._measured(frame, self._place.at[0], self._place.sigma(now_s), now_s)
         if there is None or there.trust.displaced or not weigher.held_across(there.measurement, now_s):
             return None
         slid = there.along.slide_m is not None or there.along.undecided
@@ -330,7 +331,7 @@ class Integrity:
         left_open = trust.most_probable is not None and not trust.proven
         if left_open and (trust.displaced or self._past_limit(trust.bounds)):
             return self._by_anchor(frame, candidate, now_s)
-        proved = self._weigher.proved
+        proved = self._place.proved
         where_it_was = proved and not trust.displaced
         beside_px = self._beside_px(measurement, cam_T_grip)
         moved = self._knocked(trust, beside_px, along.here)
@@ -338,18 +339,18 @@ class Integrity:
         proves = trust.proven and (moved or not trust.displaced)
         unproven = proved and not proves
         if trust.fits is not None and (proves or not (trust.displaced or proved)):
-            before = self._weigher.anchor
-            self._weigher.settle(trust, measurement, cam_T_grip, covariance, now_s)
-            assert self._weigher.anchor is not None
-            if self._weigher.anchor is not before:
+            before = self._place.anchor
+            self._place.settle(trust, measurement, cam_T_grip, covariance, now_s)
+            assert self._place.anchor is not None
+            if self._place.anchor is not before:
                 self._look.count_again()
             self._jaw_opening_m = measurement.jaw_opening_m
             if proves:
                 self.since.proved()
             first = self.since.current
-            if proves and first is not None and not first.knocked and self._weigher.moved():
+            if proves and first is not None and not first.knocked and self._place.moved():
                 self.since.moved()  # once: each change is written to the state file
-            self.since.add(self._weigher.anchor, measurement.jaw_opening_m, frame.stamp_ns)
+            self.since.add(self._place.anchor, measurement.jaw_opening_m, frame.stamp_ns)
         if proves and frame.image is not None and not (moved or trust.may_have_slid):
             # A copy: learning can wait, and the caller may read the next image into the same memory.
             self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
@@ -360,7 +361,7 @@ class Integrity:
             return standing
         # Until another frame confirms it, the gripper may as well be where it was.
         why = "the fingers stand elsewhere, or the mount was knocked just now"
-        return _reaching(standing, self._weigher.expected[0], why)
+        return _reaching(standing, self._place.at[0], why)
 
     def _knocked(self, trust: Trust, beside_px: float, seen_along: bool) -> bool:
         """Whether the mount was knocked; the edges are ``beside_px`` from the old place.  Knocks are so rare that one
@@ -374,7 +375,7 @@ class Integrity:
         self._elsewhere = self._elsewhere + 1 if trust.displaced and not trust.ambiguous else 0
         if beside_px < ONE_EDGE_PX or seen_along:
             return self._elsewhere >= 1
-        unknown = self._weigher.proved and self._strips.awaited
+        unknown = self._place.proved and self._strips.awaited
         return self._elsewhere >= self._policy.confirm_frames and not unknown
 
     def _by_anchor(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
@@ -394,7 +395,7 @@ class Integrity:
         """Whether the gripper's look excludes this pose: it is seen at the expected place, and much less here."""
         if not self._look.ready or frame.image is None:
             return False
-        poses = np.stack([cam_T_grip, self._weigher.expected[0]])
+        poses = np.stack([cam_T_grip, self._place.at[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_ODDS)
 
     def _along(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, risk: float = LOOK_ODDS) -> StripsSeen:

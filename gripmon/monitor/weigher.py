@@ -15,25 +15,24 @@ from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
-from gripmon.model.least_squares import CONTRADICTION_SQUARE, chi_square_limit
+from gripmon.model.least_squares import chi_square_limit
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Protection, ReferenceRecord
-from gripmon.monitor.anchor import Anchor
 from gripmon.monitor.bounds import SIGMA_INFLATION, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
+from gripmon.monitor.known_place import KnownPlace
 from gripmon.monitor.possible import Possible
 from gripmon.monitor.refits import Known, Refits, in_the_references_frames
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
-from gripmon.monitor.standing import Question, Trust
+from gripmon.monitor.standing import Trust
 from gripmon.monitor.tracker import Tracker
 from gripmon.track.edges import FingerEndsSeen, Measurement, has_lone_end
 from gripmon.track.edges.roles import PARALLEL_COSINE
 from gripmon.track.integrity import Mount, bounds
 from gripmon.track.integrity.frame_kernel import Fits, frame_bounds
-from gripmon.track.integrity.knocks import ALONG_OF_ALL, KNOCK_UNSEEN_PROBABILITY
+from gripmon.track.integrity.knocks import ALONG_OF_ALL, ALONG_SHARE, ANY_SHARE, KNOCK_UNSEEN_PROBABILITY
 from gripmon.track.integrity.separation import limits_of
-from gripmon.track.look import ONE_EDGE_PX
 
 LOOK_ODDS = 1e-3
 """Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
@@ -43,17 +42,15 @@ JAW_CONTRADICTED_SQUARE = chi_square_limit(1e-3, 1)
 exceeds it in one of a thousand knocks, which is then accepted a frame later.
 """
 
-LEAST_WEIGHT_RATIO = 1e-3
-"""Share of the integrity risk below which a knock under a hypothesis isn't solved but taken off the risk."""
-
-BESIDES_RATIO = 0.1
-"""The same of all knocks together where the ends and something else are something else: a tenth of the risk makes a
-normal error's bound half a percent larger.
+UNSOLVED_RATIO = 0.1
+"""Share of the integrity risk that improbable knocks may have together without being solved, and again those where the
+ends and something else are something else; it is taken off the risk.  A tenth makes a normal error's bound half a
+percent larger.
 """
 
 
 class Weigher:
-    """Protection levels of one monitor's measurements, and the anchor that they rest on."""
+    """Protection levels of one monitor's measurements, and the ``place`` that they rest on."""
 
     not_as_expected = (
         "the mount was knocked before the start, or the reference or the gripper file is off: the gripper isn't where "
@@ -83,62 +80,15 @@ class Weigher:
             play = (0.0,) * 6  # as if nothing were known of it: where the motion counts from would move with it
         self._mount = Mount(variance_per_s, settings.policy.mount_jumps_per_month, play)
         self._newest: tuple[Measurement, float, Refits] | None = None
-        self.anchor: Anchor | None = None
-        self.question: Question | None = None
-        """By how much the first proven pose differed from the expected one; None if it didn't."""
-        self._least = LEAST_WEIGHT_RATIO * settings.policy.integrity_risk
+        self.place = KnownPlace(tracker, self._mount, self._possible, reference, since)
+        self._unsolved = UNSOLVED_RATIO * settings.policy.integrity_risk
         self._axis = tracker.finger_axis
         self._along_share = ALONG_OF_ALL if self._axis.any() else 0.0  # of knocks, along the fingers
         self._along_misread = MISREAD_PROBABILITY**2  # where the strips were learnt; kept ones at a proven pose
-        self._in_place = False  # once a frame proved where the gripper was before: that shows how the report errs
-        self.rebase(reference)
-
-    def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
-        """Expect the gripper at a reference (the original, if one is restored) or at the last known pose (4, 4), until
-        a frame proves a pose.
-        """
-        expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
-        self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
-        self.unexplained: Array | None = None
-        """(6,) of an open question what every bound includes, m and rad; None for nothing."""
-        if self.question is not None:
-            self.question = self.question.with_reference(reference)
-            self.unexplained = self.question.away if self.question.open_at(reference.revision) else None
-        self._revision, self._reference_T = reference.revision, from_record(reference.cam_T_grip)
-        self._slid: bool | None = None  # not known before something is proven
 
     def restore(self, records: tuple[AtReferenceRecord, ...]) -> str | None:
         """See :meth:`AtReferences.restore`."""
         return self._since.restore(records, len(self._lasting.name), self._possible.model.parts)
-
-    @property
-    def expected(self) -> tuple[Array, Array]:
-        """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
-        return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
-
-    @property
-    def swing(self) -> Array:
-        """(6,) variance of the mount's vibration, m² and rad²."""
-        return self._mount.swing
-
-    @property
-    def misread_ever(self) -> float:
-        """Probability that what looked like the fingers' ends was something else in every frame that the anchor is the
-        average of.
-        """
-        return 1.0 if self.anchor is None else self.anchor.misread
-
-    @property
-    def proved(self) -> bool:
-        """Whether a frame has proven a pose."""
-        return self.anchor is not None and self.anchor.proven
-
-    def sigma(self, now_s: float) -> Array:
-        """(6,) standard deviations of where it is expected, m and rad."""
-        variance = self.expected[1].diagonal() + self._wander(now_s) + self._tracker.floor.diagonal()
-        if self.anchor is not None:
-            variance = variance + np.square(self.anchor.of_model).sum(axis=0)
-        return np.sqrt(variance)
 
     def weigh(
         self,
@@ -159,7 +109,7 @@ class Weigher:
         there: as few corners prove the pose as where it is expected (:func:`~gripmon.monitor.ends.proof`), and a lone
         finger hasn't slid.
         """
-        risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.anchor
+        risk, edges, anchor = self._policy.integrity_risk, measurement.normal.edge, self.place.anchor
         if not len(edges):
             return Trust(unbounded(risk, NOTHING_WRONG), False)
         fits = self._refitted(measurement, now_s)
@@ -168,7 +118,7 @@ class Weigher:
         displaced = not fits.stays[0] and explained is None
         # The proof: fingers' ends that can't be something else.
         again = bool(anchored.square[0] <= USUAL_SQUARE) and (anchor is None or anchor.confirmed)
-        may_have_slid = self._lone and not seen_along and self._may_have_slid(measurement, cam_T_grip, displaced)
+        may_have_slid = self._lone and not seen_along and self.place.may_have_slid(measurement, cam_T_grip, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         proven, misread = False, 1.0
         since_learnt = LOOK_ODDS if seen_along and not slid else 1.0
@@ -179,10 +129,10 @@ class Weigher:
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * since_learnt * (LOOK_ODDS if look_seen else 1.0)
         # Where the pose was known to be, or knocked away from there, of which the ends alone show a part.
-        shown, hidden = self._knocked(now_s)
+        shown, hidden = self.place.knocked(now_s)
         odds = shown, 1.0 if may_have_slid else hidden
         besides = odds[1] * prior[hypotheses.ends]
-        unsettled = displaced or not self.proved
+        unsettled = displaced or not self.place.proved
         without, unsolved = self._without_ends(fits, besides, unsettled)
         both, knock = self._bounds(fits, without, unsolved, prior, odds, cam_T_grip, displaced)
         both = self._with_questions(both, cam_T_grip, displaced)
@@ -201,9 +151,9 @@ class Weigher:
 
     def learnt(self, backgrounds: int) -> None:
         """The fingers' strips were learnt at the anchor, which was proved before so many different backgrounds."""
-        assert self.anchor is not None
-        self._along_misread = self.anchor.clearest
-        self.anchor.backgrounds = max(backgrounds, 1)
+        assert self.place.anchor is not None
+        self._along_misread = self.place.anchor.clearest
+        self.place.anchor.backgrounds = max(backgrounds, 1)
 
     def displaced(self, measurement: Measurement, now_s: float) -> bool:
         """Whether a measured pose isn't where the gripper is expected."""
@@ -231,12 +181,12 @@ class Weigher:
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         grasped = ambiguous and bool((possible[list(hypotheses.grasp)] > 0.0).any())
         both = trust.bounds
-        opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self._in_place
+        opened = measurement.jaw_innovation**2 > JAW_CONTRADICTED_SQUARE and self.place.in_place
         if displaced and not ambiguous and opened:
             # A knock doesn't move the jaw: flexing fingers and shadows beside them look like both at once.
             ambiguous = grasped = True
             why = "edges belong to something else, which looks like another opening and distance"
-            away = perturbation_between(self.expected[0], cam_T_grip)
+            away = perturbation_between(self.place.at[0], cam_T_grip)
             both = Bounds(*(reaching(each, away, why) for each in both))
         return replace(trust, bounds=both, ambiguous=ambiguous, grasped=grasped, most_probable=most_probable)
 
@@ -249,10 +199,10 @@ class Weigher:
         if away is not None:
             why = self.looks_otherwise if np.linalg.norm(away[:3]) > since.position_m else since.hypothesis
             since = reaching(since, away, why)
-        if self.anchor is None and displaced:
-            absolute = larger(absolute, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
-        if self.unexplained is not None:
-            absolute = larger(absolute, self._not_as_expected(self.unexplained))
+        if self.place.anchor is None and displaced:
+            absolute = larger(absolute, self._not_as_expected(perturbation_between(self.place.at_first[0], cam_T_grip)))
+        if self.place.unexplained is not None:
+            absolute = larger(absolute, self._not_as_expected(self.place.unexplained))
         return Bounds(absolute, since)
 
     def _bounds(
@@ -271,7 +221,7 @@ class Weigher:
         isn't solved; ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only
         they would.  And how far a knock moves the mount, (6, 6).
         """
-        anchor, lasting, first = self.anchor, self._lasting, fits.model.first[0]
+        anchor, lasting, first = self.place.anchor, self._lasting, fits.model.first[0]
         every, (shift, covariance, of_model), risk = fits.hypotheses, fits.alone, self._policy.integrity_risk
         stays, endless, ends, names, solved = fits.stays, every.endless, every.ends, every.name, prior
         none: Fits = shift[:0], covariance[:0], of_model[:0]
@@ -284,11 +234,13 @@ class Weigher:
         names += lasting.name + in_the_references_frames(lasting.name)
         rows, wander = self._possible.about(fits.edges).rows, fits.known.wander
         at_first = prior[:0] if first is None else lasting.priors(first.misread)
-        always = (none, cam_T_grip, *self.expected, wander, rows[:0], prior[:0])
+        always = (none, cam_T_grip, *self.place.at, wander, rows[:0], prior[:0])
         if anchor is not None and not displaced:
             always = *anchor.known, wander, rows, lasting.priors(anchor.misread)
         knocks = cam_T_grip[:3, :3] @ self._axis, ends, PARALLEL_COSINE, *odds
-        of_frame = fits.frame, (prior, stays, endless), solved, bare, fits.before, knocks, always, at_first, self._least, unsolved
+        least = self._unsolved / (len(prior) * len(ANY_SHARE + ALONG_SHARE))
+        before, less = (fits.before, knocks, always), (at_first, least, unsolved)
+        of_frame = fits.frame, (prior, stays, endless), solved, bare, *before, *less
         unnoticed = min(self._mount.knocked(self._since.elapsed_s, hidden=True), 1.0)
         moved, of_images = (False, False) if first is None else (first.knocked, first.of_images)
         unwatched = KNOCK_UNSEEN_PROBABILITY if of_images else 0.0
@@ -296,28 +248,12 @@ class Weigher:
             (cam_T_grip, displaced, *of_frame),
             fits.model.alike(cam_T_grip),
             fits.model.differences(cam_T_grip, fits.opened, self._mount.to_and_fro),
-            (self._usual_motion, displaced or moved, unwatched, unnoticed),
+            (self.place.usual_motion, displaced or moved, unwatched, unnoticed),
             limits_of(risk, SIGMA_INFLATION),
         )
         if absolute[0] == np.inf:
             return unbounded(risk, "too much may be wrong at once"), knock
         return Bounds(protection_of(absolute, names, risk), protection_of(since, names, risk)), knock
-
-    @property
-    def _usual_motion(self) -> Array:
-        """(6, 6) covariance of what a mount moves by since the reference's frames without a knock."""
-        return np.diag(self._mount.creep(self._since.elapsed_s) + self._mount.to_and_fro) + self._tracker.floor
-
-    def moved(self) -> bool:
-        """Whether the anchor isn't where the reference's frames had the gripper, by more than a mount moves by itself:
-        also after a knock while the monitor was off or the ends were hidden.
-        """
-        first, anchor = self._since.current, self.anchor
-        if first is None or anchor is None:
-            return False
-        way = perturbation_between(first.cam_T_grip, anchor.cam_T_grip)
-        covariance = anchor.covariance + first.fits.covariance[0] + self._usual_motion
-        return _contradicts(way, covariance)
 
     def _without_ends(self, fits: Refits, besides: float, unsettled: bool) -> tuple[Refits | None, float]:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that counts
@@ -330,59 +266,9 @@ class Weigher:
         if unsettled:
             return fits.under(about.without_ends), 0.0
         together = besides * about.pairs.of_more_than_ends
-        if together <= BESIDES_RATIO * self._policy.integrity_risk:
+        if together <= self._unsolved:
             return None, together
         return fits.under(about.pairs), 0.0
-
-    def settle(
-        self, trust: Trust, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
-    ) -> None:
-        """Add a pose (4, 4) with its covariance (6, 6) to the anchor, or start a new anchor with it.  One that isn't
-        proven counts until another one is, by its fits without the fingers' ends.
-        """
-        assert trust.fits is not None and trust.knock is not None
-        proven = trust.proven
-        if self.proved and not proven:
-            return
-        rows = self._possible.about(trust.fits.edges).rows
-        if proven:
-            self._slid = trust.may_have_slid
-        if self.proved:
-            assert self.anchor is not None
-            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
-            self._mount.learn(way, self.anchor.covariance.diagonal() + covariance.diagonal())
-        elif trust.displaced:
-            # Knocked while the monitor was off, or marks on the fingers, or a wrong model: a person has to decide.
-            self.unexplained = perturbation_between(self._expected[0], cam_T_grip)
-            self.question = Question(self.unexplained, self._revision)
-        if self.anchor is None or trust.displaced or proven > self.anchor.proven:
-            origin_T, known = self.expected if self.proved else self._expected
-            if trust.displaced:
-                known = known + trust.knock
-            misread = trust.misread
-            beside_px = measurement.prediction.moved_px(perturbation_between(origin_T, cam_T_grip))
-            if self.proved and beside_px < ONE_EDGE_PX:
-                misread = min(misread, self.misread_ever)  # so near to it nothing else is taken for the ends
-            at = cam_T_grip, trust.fits, rows, now_s, (origin_T, known)
-            self.anchor = Anchor(self._lasting, *at, misread, proven, trust.displaced)
-        else:
-            self._in_place = proven
-            self.anchor.add(trust.fits, rows, self._mount.creep(now_s - self.anchor.now_s), now_s, trust.misread)
-
-    def _may_have_slid(self, measurement: Measurement, cam_T_grip: Array, displaced: bool) -> bool:
-        """Whether a lone finger may have slid along itself though corners are seen: they may belong to a mark on it or
-        to something beside it.  They prove a place that the edges don't distinguish from the reference's, and then
-        each place less than :data:`ONE_EDGE_PX` from the proven one; elsewhere a person has to confirm it by a new
-        reference.
-        """
-        if self._slid is None:
-            covariance = self._expected[1] + measurement.covariance[:6, :6] + self._tracker.floor_of(measurement)
-            way = perturbation_between(self._reference_T, cam_T_grip)
-            displaced = _contradicts(way, covariance)
-        else:
-            assert self.anchor is not None
-            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
-        return bool(self._slid) or (displaced and measurement.prediction.moved_px(way) >= ONE_EDGE_PX)
 
     def held(self, both: Bounds, growth: Array, unseen_s: float, hidden: bool) -> Bounds:
         """The protection levels of a transform measured ``unseen_s`` ago, whose covariance (6, 6) has grown by
@@ -396,15 +282,6 @@ class Weigher:
             *(Protection(b.position_m + position_m, b.rotation_rad + rotation_rad, risk, b.hypothesis) for b in both)
         )
 
-    def _knocked(self, now_s: float) -> tuple[float, float]:
-        """Probability that the mount was knocked since the pose was last proven, or since the reference's images, if
-        nothing hides what would show it, and if something does.
-        """
-        if self.anchor is None:
-            return KNOCK_UNSEEN_PROBABILITY, KNOCK_UNSEEN_PROBABILITY
-        shown = self._mount.knocked(now_s - self.anchor.now_s, hidden=False)
-        return shown, max(shown, KNOCK_UNSEEN_PROBABILITY)
-
     def confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """See :meth:`EndsEvidence.confirmations`."""
         return self._ends.confirmations(measurement, ends)
@@ -413,7 +290,7 @@ class Weigher:
         """Whether enough of the fingers' sides is seen at the anchor to exclude a knock across the fingers since it was
         proven (before anything is proven: just now).  The edges at the ends don't show such a knock.
         """
-        excluded = self._knocked(now_s)[1] * self._ends.sides_misread(measurement)
+        excluded = self.place.knocked(now_s)[1] * self._ends.sides_misread(measurement)
         return within(excluded, self._policy.integrity_risk)
 
     def _sure(self, fits: Refits, cam_T_grip: Array) -> bool:
@@ -427,37 +304,24 @@ class Weigher:
     def _not_as_expected(self, away: Array) -> Protection:
         """The protection level where the first frames differ from the reference by ``away`` (6,)."""
         risk = self._policy.integrity_risk
-        position_m, rotation_rad = _radii(self._expected[1], risk)
+        position_m, rotation_rad = _radii(self.place.at_first[1], risk)
         why = self.not_as_expected
         return reaching(Protection(position_m, rotation_rad, risk, why), away, why)
-
-    def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the motion since the anchor: creep, vibration and play.  Before there is one without play:
-        whether the first frames are where the reference has the gripper is asked by what that says of itself.
-        """
-        if self.anchor is None:
-            return self.swing
-        return self._mount.creep(now_s - self.anchor.now_s) + self._mount.to_and_fro
 
     def _refitted(self, measurement: Measurement, now_s: float) -> Refits:
         """The fits of a measurement, alone and with what is known of the pose.  They are kept while the same
         measurement is weighed again: with its ends checked, or for another pose.
         """
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
-            expected_T, covariance = self.expected
-            of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
-            wander = self._wander(now_s)
+            expected_T, covariance = self.place.at
+            of_model = np.zeros((1, 6)) if self.place.anchor is None else self.place.anchor.of_model
+            wander = self.place.wander(now_s)
             known = Known(expected_T, covariance + np.diag(wander), of_model, wander)
             model = self._possible.model._replace(first=self._since.published_by)
             hypotheses = self._possible.about(measurement.normal.edge, measurement.doubtful).hypotheses
             floor = self._tracker.floor_of(measurement)
             self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]
-
-
-def _contradicts(way: Array, covariance: Array) -> bool:
-    """Whether a motion (6,) is larger than its covariance (6, 6) allows."""
-    return bool(way @ np.linalg.solve(covariance, way) > CONTRADICTION_SQUARE)
 
 
 def _radii(covariance: Array, risk: float) -> list[float]:
