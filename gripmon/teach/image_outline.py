@@ -15,6 +15,7 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.model.staying import Bits, Plane
 from gripmon.teach.beyond import Background
+from gripmon.teach.constant_grey import amended
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
@@ -75,8 +76,19 @@ def see_opening(
     :func:`~gripmon.teach.fingers.find_fingers`.  Raises :class:`NoResultError`.
     """
     matte = find_matte(images, least_noise, step)
-    left_out = dict(matte.left_out)
     parts = find_fingers(matte.still, matte.edges, fingers, within)
+    try:
+        return _seen(camera, matte, parts, len(images), step)
+    except UnclearPartsError as unclear:
+        try:
+            return _seen(camera, matte, amended(matte, parts), len(images), step)
+        except NoResultError:
+            raise unclear from None
+
+
+def _seen(camera: Camera, matte: Matte, parts: Parts, count: int, step: Callable[[], None]) -> OpeningSeen:
+    """What ``count`` images show of the outlines of these parts."""
+    left_out = dict(matte.left_out)
     contours = [(part, contour) for part in parts.fingers for contour in trace(part, int(SHORTEST_OUTLINE_PX))]
     for turn in range(_TURNS):
         stations, found = _around(matte, contours, parts.rest)
@@ -88,9 +100,9 @@ def see_opening(
         bad = _blurred(found)
         if bad:
             left_out.update({matte.kept[k]: why for k, why in bad.items()})
-            if len(matte.kept) - len(bad) < max(FEWEST_IMAGES, (len(images) + 2) // 2):
+            if len(matte.kept) - len(bad) < max(FEWEST_IMAGES, (count + 2) // 2):
                 raise NoResultError(
-                    f"{len(left_out)} of {len(images)} images can't be used ({next(iter(bad.values()))}); a camera "
+                    f"{len(left_out)} of {count} images can't be used ({next(iter(bad.values()))}); a camera "
                     "that is fixed to the gripper, jaws at rest, sharp images"
                 )
             matte = _without(matte, bad)
