@@ -159,8 +159,11 @@ def test_two_steps_of_one_alert_are_two_events():
     assert second.moved.size_m == pytest.approx(4e-3, abs=5e-6)
 
 
-def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations():
+@pytest.mark.parametrize("frames_left", [200, 3])
+def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations(frames_left: int):
+    """Also where the recording ends less than a second after it: the last second is of both references then."""
     run = stepped()
+    changed = len(run.records) - frames_left
     renewed = msgspec.structs.replace(
         REFERENCE,
         reference_id="second",
@@ -172,13 +175,14 @@ def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations():
         accepted_by="operator",
         parent="first",
     )
-    run.records[400:] = [msgspec.structs.replace(r, reference_id="second", revision=2) for r in run.records[400:]]
+    for k in range(changed, len(run.records)):
+        run.records[k] = msgspec.structs.replace(run.records[k], reference_id="second", revision=2)
     run.references = (REFERENCE, renewed)
     recording = only(run)
     ranges = {a.what: a for a in recording.affected}
     assert ranges["old_calibration"].ended_by == "end_of_recording"
     assert ranges["stale_reference"].ended_by == "recalibration"
-    assert ranges["stale_reference"].end_ns == START_NS + 400 * PERIOD_NS
+    assert ranges["stale_reference"].end_ns == START_NS + changed * PERIOD_NS
     assert [r.reference_id for r in recording.references] == ["first", "second"]
     assert recording.references[1].step.size_m == pytest.approx(3e-3)
     assert recording.at_end.size_m == pytest.approx(3e-3, abs=1e-5)

@@ -62,6 +62,14 @@ def test_a_first_start_says_what_took_so_long(part: Part, caplog: pytest.LogCapt
     assert re.search(r"compiling what every frame needs.*: 0 of \d+, now kernel.one", caplog.text)
 
 
+def test_where_nobody_reads_the_log_it_is_said_on_stderr(part: Part, capsys: pytest.CaptureFixture[str]):
+    """As in `gripmon check` and `teach`, the first commands of a new installation, which said nothing for minutes."""
+    part.takes_s = 8.0
+    warm_up()
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and re.search(r"compiling what every frame needs.*: 0 of \d+, now kernel.one", said[0])
+
+
 def test_a_full_disk_costs_time_at_every_start_and_no_start(part: Part):
     part.takes_s, part.failures = 2.0, 7
     said = warm_up()

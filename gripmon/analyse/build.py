@@ -82,7 +82,7 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         summary="",
         limits=limits,
         at_end=track.displacement(track.against_first, last),
-        at_end_against_reference=track.displacement(track.against_reference, last),
+        at_end_against_reference=track.displacement(track.against_reference, _of_newest_reference(track, last)),
         last_measured_ns=int(track.stamp_ns[last[-1]]) if last.size else None,
         events=_numbered(events, source, track),
         affected=tuple(sorted(affected, key=lambda a: (a.start_ns, a.what))),
@@ -97,6 +97,11 @@ def _analysed(source: Recording, affected_m: float | None, affected_rad: float |
         faults=(*(fault for fault in source.faults if fault not in dropped), *track.faults),
     )
     return msgspec.structs.replace(report, summary=paragraph(report))
+
+
+def _of_newest_reference(track: Track, frames: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those of some frames (indices) that are measured against the same reference as the last one."""
+    return frames[track.reference[frames] == track.reference[frames[-1]]] if frames.size else frames
 
 
 def _last(track: Track, motions: Sequence[Event]) -> NDArray[np.intp]:

@@ -215,6 +215,9 @@ def main(arguments: list[str] | None = None) -> int:
         # The reader of our output has closed it.  Without this Python would report it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
+    except KeyboardInterrupt:  # also while modules are imported
+        print("gripmon: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
 def _run(words: list[str]) -> int:
@@ -233,9 +236,6 @@ def _run(words: list[str]) -> int:
     except (InputError, NoResultError) as error:
         print(_in_words(error, chosen), file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
-        print("gripmon: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
 
 
 def _arguments() -> Arguments:

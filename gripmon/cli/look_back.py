@@ -345,9 +345,11 @@ def dataset(arguments: Arguments) -> int:
       episodes-…/                            a file for each measured episode: a new call measures only the rest
     """
     from gripmon.daemon.dataset import measure_dataset
+    from gripmon.monitor import warm_up
 
     if (arguments.tolerance_mm is None) != (arguments.tolerance_deg is None):
         raise InputError("--tolerance-mm and --tolerance-deg belong together; both, or neither")
+    warm_up()  # before all workers do
     with progress_bar(None, "episode") as step:
         found = measure_dataset(
             arguments.dataset,

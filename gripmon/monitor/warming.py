@@ -51,7 +51,7 @@ _DONE = "done"
 
 def warm_up() -> str:
     """Load the machine code that frames need, or compile it in all cores, once on a machine, with a bar on a terminal
-    and lines in the log elsewhere; return a message for the user, or an empty string.
+    and lines in the log, or on stderr where nobody reads the log, elsewhere; return a message for the user, or an empty string.
     """
     begin_s, unkept = time.perf_counter(), ""
     with contextlib.ExitStack() as closing:
@@ -210,6 +210,10 @@ def _shown(closing: contextlib.ExitStack) -> Callable[[int, int, str], None]:
         nonlocal said_s
         if time.monotonic() - said_s >= SAID_EVERY_S:
             said_s = time.monotonic()
-            _log.info("%s: %d of %d, now %s", what, ready, total, name)
+            text = f"{what}: {ready} of {total}, now {name}"
+            if _log.isEnabledFor(logging.INFO):
+                _log.info("%s", text)
+            else:
+                print(text, file=sys.stderr, flush=True)
 
     return say

@@ -25,7 +25,7 @@ from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.model.response import Response, ResponseSeen, response_of
 from gripmon.model.yaml_text import as_yaml
-from gripmon.monitor import MonitorSettings, Tracker, seen_in_images
+from gripmon.monitor import MonitorSettings, Tracker, seen_in_images, warm_up
 from gripmon.teach.drawing import draw_taught
 from gripmon.teach.kept import Kept, as_frames, kept, with_help
 from gripmon.teach.measure import Taught
@@ -158,6 +158,7 @@ def taught_from(
     the settings for the ``response``; ``data``: by path, images not yet written to files.  Raises
     :class:`~gripmon.teach.views.TeachingRefused`.
     """
+    warm_up()
     nominal_m = rig.gripper.jaw_nominal_m
     shown = [
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures

@@ -93,7 +93,7 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         float,
         Meta(
             gt=0.0,
-            le=1.0,
+            le=0.1,
             description="position error of the TCP that the task tolerates: a transform is valid while its "
             "protection level is at most this (m)",
         ),
