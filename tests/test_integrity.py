@@ -408,18 +408,6 @@ def test_without_ends_each_hypothesis_doubts_them_besides():
     assert {every.name[k] for k in np.flatnonzero(more)} == wrong
 
 
-def test_edge_by_edge_each_is_something_else_with_the_same_probability():
-    every = of_two_fingers(has_opening=True)
-    doubtful = every.edge_by_edge(0.1)
-    prior = dict(zip(doubtful.name, doubtful.prior.tolist(), strict=True))
-    assert {p for name, p in prior.items() if name.startswith("edge ")} == {0.1}
-    assert prior["the ends of finger a belong to something else"] == pytest.approx(1e-2), "two edges"
-    assert prior["the fingers' inner edges belong to what is grasped"] == pytest.approx(1e-2)
-    assert prior["finger a is not where its model says"] == WRONG_GRIPPER, "four edges: no less than it was"
-    assert prior["the jaw opening is wrong"] == WRONG_GRIPPER and prior["nothing is wrong"] == 1.0
-    np.testing.assert_array_equal(doubtful.keep, every.keep)
-
-
 def test_where_the_ends_are_something_else_an_edge_may_be_wrong_besides():
     """Of the sides one alone tells much of a motion along z.  If that is something else as well, which has moved with
     what looks like the ends, what reckons with one thing at a time states far too little.

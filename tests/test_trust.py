@@ -386,26 +386,6 @@ def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_tha
     assert not weigher.held_across(of_two, weigher.place.anchor.now_s + 1.1e-3 * month_s)
 
 
-def test_where_too_few_search_lines_agree_one_edge_does_not_show_a_knock_along_the_fingers():
-    """Two sides of one finger, and an edge across the other: that may be print on what hides the finger.  It happens in
-    one of ten such frames, and a knock while the ends are hidden in one of a thousand.
-    """
-    monitor = new_monitor()
-    for frame in frames_of(scene(BEGINS))[0]:
-        monitor.process(frame)
-    measurement, weigher = monitor._newest, monitor._trust._weigher
-    assert measurement is not None and weigher.place.anchor is not None
-    normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
-    edges = normal.edge.tolist()
-    seen = np.array([(along[edge] and names[edge][0] == "R") or names[edge] == "L_tip_near" for edge in edges])
-    of_few = {part.name: getattr(normal, part.name)[seen] for part in fields(normal)}
-    few = replace(measurement, normal=replace(normal, **of_few))
-    at = monitor._cam_T_grip, FingerEndsSeen(*map(np.array, ([0, 0], [3, 3], [0, 0]))), weigher.place.anchor.now_s
-    agreed, doubtful = weigher.weigh(few, *at), weigher.weigh(replace(few, doubtful=True), *at)
-    level, less = agreed.bounds.absolute, doubtful.bounds.absolute
-    assert less.position_m > 1.5 * level.position_m and less.hypothesis.endswith("belongs to something else")
-
-
 def test_while_images_are_refused_the_bound_grows_with_time():
     frames, truths = frames_of(scene(36))
     dark = [

@@ -15,7 +15,7 @@ from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Frame
 from gripmon.monitor.anchor import Lasting, average_of
 from gripmon.monitor.bounds import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, unbounded
 from gripmon.monitor.common import CommonError, Tilt
-from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof
+from gripmon.monitor.ends import EndsEvidence, proof
 from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReference, Bounds, digest_of
@@ -49,7 +49,7 @@ class Possible:
         self._gripper, self._along, self._sides = gripper, tracker.along, sides(gripper)
         self._words, self._inner = in_words(gripper, cam_T_grip), inner_edges(gripper)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
-        self._kept: dict[tuple[bytes, bool], About] = {}
+        self._kept: dict[bytes, About] = {}
         self.lasting = Lasting.of(self.hypotheses(np.arange(len(gripper.edge_ids))))
         file, taught, offset = gripper.model, tracker.taught_error, tracker.taught_offset
         wrong = file.scale_sigma or file.tilt_sigma_rad or len(taught) or offset.any()
@@ -63,17 +63,13 @@ class Possible:
         of_each = self._gripper.edge_finger[edges], self._words.fingers, self._along[edges], self._inner[edges]
         return hypotheses_of(names, *of_each, self._may_open, tuple(side[edges] for side in self._sides))
 
-    def about(self, edges: NDArray[np.intp], doubtful: bool = False) -> About:
-        """The same with what follows from it, kept from frame to frame.  ``doubtful``: too few search lines agree, so
-        that an edge that is seen is as probably something else as an end is.
-        """
-        key = edges.tobytes(), doubtful
+    def about(self, edges: NDArray[np.intp]) -> About:
+        """The same with what follows from it, kept from frame to frame."""
+        key = edges.tobytes()
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
             hypotheses = self.hypotheses(edges)
-            if doubtful:
-                hypotheses = hypotheses.edge_by_edge(MISREAD_PROBABILITY)
             without = hypotheses.without_ends()
             rows = self.lasting.rows(hypotheses, edges)
             self._kept[key] = About(hypotheses, without, without.pairs(), rows)

@@ -83,8 +83,6 @@ class Refits:
         )  # fmt: skip
         self.edges: NDArray[np.intp] = normal.edge
         """(v,) edges that the fits are made of."""
-        self.doubtful = measurement.doubtful
-        """Whether too few search lines agree."""
         self.before: Fits = at, *before
         """The pose that is known, from the fits' (6,), its covariance (6, 6), and its errors by the model."""
         # The free fit's distance from what is known, in units of both covariances.

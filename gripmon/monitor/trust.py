@@ -319,7 +319,7 @@ class Integrity:
         measurement = self._tracker.measure_held(frame, cam_T_grip, sigma)
         if measurement.consensus.share == 0.0:
             return None
-        measurement.trusted, measurement.doubtful = True, not measurement.trusted
+        measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
         ends, along = self._tracker.ends(frame, measurement), self._along(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)

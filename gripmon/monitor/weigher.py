@@ -262,7 +262,7 @@ class Weigher:
         """
         if not fits.hypotheses.across.any():
             return fits, 0.0
-        about = self._possible.about(fits.edges, fits.doubtful)
+        about = self._possible.about(fits.edges)
         if unsettled:
             return fits.under(about.without_ends), 0.0
         together = besides * about.pairs.of_more_than_ends
@@ -318,7 +318,7 @@ class Weigher:
             wander = self.place.wander(now_s)
             known = Known(expected_T, covariance + np.diag(wander), of_model, wander)
             model = self._possible.model._replace(first=self._since.published_by)
-            hypotheses = self._possible.about(measurement.normal.edge, measurement.doubtful).hypotheses
+            hypotheses = self._possible.about(measurement.normal.edge).hypotheses
             floor = self._tracker.floor_of(measurement)
             self._newest = measurement, now_s, Refits(measurement, hypotheses, floor, model, known)
         return self._newest[2]

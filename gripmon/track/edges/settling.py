@@ -82,7 +82,6 @@ class Measurement:
     seen edges are less certain by what is cut off beside them, white or black, than by all else.
 
     ``trusted``: enough search lines agree; fewer suffice where the gripper was expected than where it was looked for.
-    ``doubtful``: it is trusted for where it is, though too few agree.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
 
@@ -102,7 +101,6 @@ class Measurement:
     blur_px: float | None
     cut_off: NDArray[np.bool_]
     trusted: bool = False
-    doubtful: bool = False
     looked_far: bool = False
     jaw_seen: OpeningSeen | None = None
 

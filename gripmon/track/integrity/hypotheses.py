@@ -58,11 +58,6 @@ class Hypotheses:
         """The sum of the priors of these."""
         return float(self.prior[self.more_than_ends].sum())
 
-    def edge_by_edge(self, each: float) -> Hypotheses:
-        """The same where each edge by itself is something else with a probability ``each``, or more."""
-        doubted = np.count_nonzero(self.keep == 0.0, axis=1)
-        return replace(self, prior=np.where(doubted > 0, np.maximum(self.prior, each**doubted), self.prior))
-
     def without_ends(self) -> Hypotheses:
         """The same where no end of a finger is what it seems besides."""
         name = tuple(f"{name}, and what looks like ends" for name in self.name)
