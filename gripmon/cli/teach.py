@@ -122,7 +122,8 @@ def teach(arguments: Arguments) -> None:
     if not arguments.image:
         raise InputError("teach: no image; image files, or --page --live DEVICE")
     if arguments.config is None:
-        raise InputError("teach: --config is missing; a configuration, or --page or --corners with --camera and --gripper")
+        right = "a configuration, or --page or --corners with --camera and --gripper"
+        raise InputError(f"teach: --config is missing; {right}")
     arguments.refuse(_NEED_CORNERS, "goes with --page or --corners")
     from gripmon.daemon.config import load_config
     from gripmon.daemon.config.writing import name_taught

@@ -51,7 +51,8 @@ _DONE = "done"
 
 def warm_up() -> str:
     """Load the machine code that frames need, or compile it in all cores, once on a machine, with a bar on a terminal
-    and lines in the log, or on stderr where nobody reads the log, elsewhere; return a message for the user, or an empty string.
+    and lines in the log, or on stderr where nobody reads the log, elsewhere; return a message for the user, or an empty
+    string.
     """
     begin_s, unkept = time.perf_counter(), ""
     with contextlib.ExitStack() as closing:
@@ -214,6 +215,6 @@ def _shown(closing: contextlib.ExitStack) -> Callable[[int, int, str], None]:
             if _log.isEnabledFor(logging.INFO):
                 _log.info("%s", text)
             else:
-                print(text, file=sys.stderr, flush=True)
+                sys.stderr.write(f"{text}\n")
 
     return say
