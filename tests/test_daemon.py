@@ -455,6 +455,41 @@ def test_lines_for_people_on_stderr(capsys: pytest.CaptureFixture[str]):
     assert lines[-1].endswith("INFO stopped after 3 frames, 0 refused, 0 dropped")
 
 
+def test_the_daemons_own_alerts_are_in_the_answers_to_commands():
+    """The monitor knows nothing of a camera that is silent: `send state` said "tracking", `acknowledge` refused."""
+
+    class Knowing(ScriptedMonitor):
+        def command(self, command: Command, stamp_ns: int) -> CommandReply:
+            if command.name is CommandName.STATE:
+                text, state = "tracking, plate-2 in force, revision 3", self.state()
+                return CommandReply(command.name, True, text, "plate-2", 3, state)
+            return CommandReply(command.name, False, "no open alert that isn't acknowledged", "plate-2", 3)
+
+    class Asked:
+        def __init__(self, name: CommandName) -> None:
+            self.command = Command(name)
+
+        def answer(self, answer: CommandReply, attachment: bytes | None = None) -> None:
+            answers.append(answer)
+
+    class Asking:
+        def poll(self) -> Asked | None:
+            return Asked(waiting.pop(0)) if bench.network.alerts and waiting else None
+
+    answers: list[CommandReply] = []
+    waiting = 2 * [CommandName.STATE, CommandName.ACKNOWLEDGE]
+    silent = [each for _ in range(12) for each in (pause(0.03), Waiting("no device"))]
+    bench = Bench([0, *silent], Knowing(), stale_after_s=0.02, no_camera_alert_after_s=0.05)
+    bench.run(commands=Asking())
+    raised, acknowledged = bench.network.alerts
+    state, seen, later, again = answers
+    assert state.text == "stale, plate-2 in force, revision 3"
+    assert [each.alert.kind for each in state.monitor.alerts] == [AlertKind.SOURCE]
+    assert not state.monitor.alerts[0].alert.acknowledged and later.monitor.alerts[0].alert.acknowledged
+    assert seen.done and seen.text == f"acknowledged: {raised.alert_id}" and not again.done
+    assert acknowledged.acknowledged and acknowledged.alert_id == raised.alert_id
+
+
 def test_commands_get_a_quarter_of_the_loops_time_at_most():
     """A flood of them delays frames little: the loop lives for a second, and each takes 20 ms."""
     took_s = 0.02

@@ -229,7 +229,7 @@ class Daemon(Telling):
 
     def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
         """Carry out a command; may raise."""
-        answer, reports = self._monitor.command(command, stamp_ns), self._reports
+        answer, reports = self._answered(command, stamp_ns), self._reports
         if answer.monitor is None or reports.alert_limit_m is None or reports.alert_limit_rad is None:
             return answer
         # A frame from before the camera fell silent says nothing about where somebody has moved it since.
@@ -237,6 +237,20 @@ class Daemon(Telling):
         limits = reports.alert_limit_m, reports.alert_limit_rad
         mount = mount_of(newest, to_stand_at(answer.monitor.references), *limits)
         return msgspec.structs.replace(answer, mount=mount)
+
+    def _answered(self, command: Command, stamp_ns: int) -> CommandReply:
+        """The monitor's answer, with what it doesn't know: that the camera is silent, and the alerts raised here."""
+        answer, watch = self._monitor.command(command, stamp_ns), self._watch
+        if command.name is CommandName.ACKNOWLEDGE and (seen := watch.acknowledge(command.argument)):
+            for alert in seen:
+                self._alert(alert, watch.state)
+            before = f"{answer.text}, " if answer.done else "acknowledged: "
+            return msgspec.structs.replace(answer, done=True, text=before + ", ".join(a.alert_id for a in seen))
+        if answer.monitor is None:
+            return answer
+        of_both = msgspec.structs.replace(answer.monitor, alerts=(*answer.monitor.alerts, *watch.open))
+        text = f"{watch.state}, {answer.text.partition(', ')[2]}"
+        return msgspec.structs.replace(answer, text=text, monitor=of_both)
 
     def _settle(self, answer: CommandReply | None) -> CommandReply | None:
         """The answer to a command (None: it failed): what is reported as done must persist after a crash."""

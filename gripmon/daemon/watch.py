@@ -230,6 +230,15 @@ class Watch:
         )
 
     @property
+    def open(self) -> tuple[OpenAlert, ...]:
+        """The alerts raised here that are open."""
+        return self._alerts.open
+
+    def acknowledge(self, alert_id: str) -> tuple[Alert, ...]:
+        """A person has seen those raised here: one, or all for an empty id.  What is told of it; empty: none."""
+        return self._alerts.acknowledge(alert_id)
+
+    @property
     def gives_up(self) -> bool:
         """Whether errors have persisted for as long as the settings allow."""
         return self.errors_in_a_row >= self._settings.give_up_after_errors
