@@ -28,7 +28,7 @@ from gripmon.daemon.running import run
 from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Source
 from gripmon.judge.statefile import StateFile
-from gripmon.model.atomic import writable_folder
+from gripmon.model.atomic import writable_folder, writing
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Array, Cause, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
@@ -76,10 +76,8 @@ def run_file(path: Path, options: RunOptions, *, verbose: bool = False, log_json
     look_ahead(config)
     if options.out is not None:
         lines = writable_folder(options.out) / "estimates.jsonl"
-        try:
+        with writing(lines, "out"):
             lines.open("ab").close()
-        except OSError as error:
-            raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
     log_to_stderr(verbose=verbose, as_json=log_json)
     return run_monitor(config, options)
 
