@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.configurations import shipped
 from support.gripmon_process import GRIPMON, ROOT, start
 from support.small_disks import fill, small_disk
 
@@ -211,9 +212,7 @@ def test_check_says_what_the_calibration_expects(capsys: pytest.CaptureFixture[s
 
 
 def test_check_tells_a_camera_that_is_absent_from_one_that_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    text = builtin_config("live_camera.yaml").read_text()
-    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
-    path = tmp_path / "live.yaml"
+    text, path = shipped("live_camera.yaml"), tmp_path / "live.yaml"
     path.write_text(text.replace("device: 0 ", f"device: rtsp://127.0.0.1:{free_port()}/wrist "))
     assert main(["check", str(path)]) == 3
     assert "NOT REACHABLE" in capsys.readouterr().out
@@ -252,8 +251,7 @@ def test_a_scenario_file_on_an_own_gripper(tmp_path: Path):
     scenario = tmp_path / "s.yaml"
     scenario.write_text("name: mine\nduration_s: 0.2\nfps: 10\n")
     config = tmp_path / "c.yaml"
-    text = builtin_config("live_camera.yaml").read_text()
-    config.write_text(text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/"))
+    config.write_text(shipped("live_camera.yaml"))
     assert main(["simulate", str(scenario), "--config", str(config), "--out", str(tmp_path / "out")]) == 0
     assert load_config(tmp_path / "out" / "config.yaml").gripper.name == "adaptive_arc_fingers"
     assert len(list((tmp_path / "out").glob("*.png"))) == 2
