@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from support.configurations import demo_in
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
@@ -20,13 +21,8 @@ WXYZ = [0.963637, 0.267184, 0.003984, -0.001105]  # the demo's quaternion in the
 
 def written(folder: Path, **changes: Any) -> Path:
     """The demo's configuration with some of its sections changed key by key."""
-    content = yaml.safe_load(DEMO.read_text())
-    content["gripper"] = str(DEMO.parent / content["gripper"])
-    for section, values in changes.items():
-        content[section] = {**content[section], **values} if section != "source" else values
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(content))
-    return path
+    before = yaml.safe_load(DEMO.read_text())
+    return demo_in(folder, **{k: v if k == "source" else {**before[k], **v} for k, v in changes.items()})
 
 
 def checked(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, tuple[str, str]]]:

@@ -5,22 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
+from support.configurations import demo_in
 
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
 from gripmon.io.wire.session import endpoint_fault
 
 TLS_FILE = '{listen: {endpoints: ["tls/127.0.0.1:7449"]}, transport: {link: {tls: {listen_certificate: "gone.pem"}}}}'
-
-
-def written(folder: Path, **sections: object) -> str:
-    """The demo's configuration with other sections, in a file."""
-    settings = yaml.safe_load(builtin_config("demo.yaml").read_text())
-    gripper = builtin_config("demo.yaml").parent / settings["gripper"]
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(settings | {"gripper": str(gripper)} | sections))
-    return str(path)
 
 
 def refused(path: str, capsys: pytest.CaptureFixture[str]) -> str:
@@ -49,7 +39,7 @@ def test_a_session_that_cannot_be_opened(
     publish: dict[str, object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     (tmp_path / "tls.json5").write_text(TLS_FILE)
-    assert said in refused(written(tmp_path, publish=publish), capsys)
+    assert said in refused(str(demo_in(tmp_path, publish=publish)), capsys)
 
 
 @pytest.mark.parametrize(

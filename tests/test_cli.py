@@ -17,15 +17,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
+from support.configurations import shipped
 from support.gripmon_process import GRIPMON, ROOT, start
 from support.small_disks import fill, small_disk
 
 from gripmon.cli import build_parser, main
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.model.records import FrameRecord
 
 COMMANDS = (
     "demo",
@@ -47,17 +46,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-@pytest.fixture
-def live_simulation(tmp_path: Path) -> Path:
-    """A configuration of a simulated camera that goes on for ever, on a free port."""
-    text = builtin_config("demo.yaml").read_text()
-    text = text.replace("7447", str(free_port())).replace("fps: 60.0", "fps: 20.0")
-    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
-    path = tmp_path / "live.yaml"
-    path.write_text(text)
-    return path
 
 
 def options_below(parser: argparse.ArgumentParser, *called: str) -> Iterator[tuple[str, argparse.Action]]:
@@ -224,9 +212,7 @@ def test_check_says_what_the_calibration_expects(capsys: pytest.CaptureFixture[s
 
 
 def test_check_tells_a_camera_that_is_absent_from_one_that_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    text = builtin_config("live_camera.yaml").read_text()
-    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
-    path = tmp_path / "live.yaml"
+    text, path = shipped("live_camera.yaml"), tmp_path / "live.yaml"
     path.write_text(text.replace("device: 0 ", f"device: rtsp://127.0.0.1:{free_port()}/wrist "))
     assert main(["check", str(path)]) == 3
     assert "NOT REACHABLE" in capsys.readouterr().out
@@ -234,20 +220,6 @@ def test_check_tells_a_camera_that_is_absent_from_one_that_answers(tmp_path: Pat
         path.write_text(text.replace("device: 0 ", f"device: rtsp://127.0.0.1:{server.getsockname()[1]}/wrist "))
         assert main(["check", str(path)]) == 0
     assert "answers" in capsys.readouterr().out
-
-
-def test_check_refuses_images_that_the_calibration_does_not_belong_to(
-    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    text = (sequence / "config.yaml").read_text()
-    path = tmp_path / "other.yaml"
-    path.write_text(
-        text.replace("width_px: 768", "width_px: 640")
-        .replace("path: .", f"path: {sequence}")
-        .replace("gripper.yaml", str(sequence / "gripper.yaml"))
-    )
-    assert main(["check", str(path)]) == 2
-    assert "is 768 x 576" in capsys.readouterr().err
 
 
 def test_a_simulated_sequence_carries_its_truth_and_a_configuration_that_agrees(sequence: Path):
@@ -279,29 +251,10 @@ def test_a_scenario_file_on_an_own_gripper(tmp_path: Path):
     scenario = tmp_path / "s.yaml"
     scenario.write_text("name: mine\nduration_s: 0.2\nfps: 10\n")
     config = tmp_path / "c.yaml"
-    text = builtin_config("live_camera.yaml").read_text()
-    config.write_text(text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/"))
+    config.write_text(shipped("live_camera.yaml"))
     assert main(["simulate", str(scenario), "--config", str(config), "--out", str(tmp_path / "out")]) == 0
     assert load_config(tmp_path / "out" / "config.yaml").gripper.name == "adaptive_arc_fingers"
     assert len(list((tmp_path / "out").glob("*.png"))) == 2
-
-
-def test_ctrl_c_stops_the_daemon_with_everything_written(live_simulation: Path, tmp_path: Path):
-    """Either signal to a daemon of stand-ins: test_daemon_processes.py."""
-    out = tmp_path / "out"
-    with start("run", live_simulation, "--out", out) as process:
-        wait_for(lambda: (out / "estimates.jsonl").exists() and (out / "estimates.jsonl").stat().st_size > 0, process)
-        sent_s = time.monotonic()
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=20)
-        took_s = time.monotonic() - sent_s
-    assert process.returncode == 130, err
-    assert "Traceback" not in err
-    assert took_s < 15.0, "2 s are promised; a loaded test machine gets more"
-    lines = (out / "estimates.jsonl").read_bytes().splitlines()
-    seqs = [msgspec.json.decode(line, type=FrameRecord).seq for line in lines]
-    assert seqs == sorted(set(seqs)), "whole lines, in order"
-    assert list(out.glob("*.rrd"))
 
 
 def test_ctrl_c_in_simulate_leaves_no_traceback(tmp_path: Path):

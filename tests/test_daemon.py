@@ -404,13 +404,6 @@ def test_real_time_priority_is_asked_for_only_where_a_configuration_does(
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_signals_stop_the_loop_with_their_code(number: signal.Signals, code: int):
-    bench = Bench([0, lambda _: signal.raise_signal(number), 1, 2, 3])
-    assert bench.run() == code
-    assert [record.seq for record in bench.network.transforms] == [0, 1]
-
-
 def test_it_runs_beside_the_main_thread():
     bench = Bench(range(3))
     codes: list[int] = []

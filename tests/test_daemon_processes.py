@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import zenoh
 from scipy.spatial.transform import Rotation
+from support.configurations import shipped
 from support.daemon_process import ROTATION, TRANSLATION_M
 from support.loopback import WAIT_S, accepts, ask, can_bind, free_endpoint, plain_session, wait_until
 
@@ -136,15 +137,8 @@ def test_the_whole_daemon_from_camera_to_subscriber(endpoint: str, tmp_path: Pat
     """
     from rerun.chunk import RrdReader
 
-    config = (HERE.parent / "configs" / "demo.yaml").read_text()
-    for before, after in (
-        ("tcp/127.0.0.1:7447", endpoint),
-        ("gripper: grippers/", f"gripper: {HERE.parent}/configs/grippers/"),
-        ("fps: 60.0", "fps: 15.0"),
-    ):
-        assert config.count(before) == 1
-        config = config.replace(before, after)
-    (tmp_path / "demo.yaml").write_text(config)
+    changes = ("tcp/127.0.0.1:7447", endpoint), ("fps: 60.0", "fps: 15.0")
+    (tmp_path / "demo.yaml").write_text(shipped("demo.yaml", *changes))
     command = [sys.executable, "-m", "gripmon", "run", str(tmp_path / "demo.yaml"), "--out", str(tmp_path / "out")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=HERE.parent, start_new_session=True)
     try:

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.commanded import Loop
+from support.configurations import shipped
 from support.loopback import WAIT_S, frame_record, free_endpoint, state_record, wait_until
 from support.published import Published
 from support.teach_page_browser import Visitor, browser, page
@@ -310,18 +311,14 @@ def test_wrong_use(arguments: list[str], said: str, capsys: pytest.CaptureFixtur
 def daemon(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """The demo's camera, which is knocked after some seconds; the new reference has to be accepted by a person."""
     endpoint = free_endpoint()
-    text = (ROOT / "configs" / "demo.yaml").read_text()
-    for old, new in (
-        ("gripper: grippers/", f"gripper: {ROOT}/configs/grippers/"),
+    changes = (
         ("tcp/127.0.0.1:7447", endpoint),
         ("fps: 60.0", "fps: 12.0"),
         ("duration_s: 20.0", "duration_s: 6.0"),
         ("sure_sigma_m: 5.0e-5", "sure_sigma_m: 1.0e-6"),
         ("  enabled: true          #", "  enabled: false #"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "c.yaml").write_text(text)
+    )
+    (tmp_path / "c.yaml").write_text(shipped("demo.yaml", *changes))
     command = [sys.executable, "-m", "gripmon", "run", str(tmp_path / "c.yaml")]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as process:

@@ -24,6 +24,7 @@ import msgspec
 import pytest
 import yaml
 from support import sample_messages
+from support.configurations import shipped, with_sections
 from support.loopback import WAIT_S, accepts, alert_record, frame_record, free_endpoint, wait_until
 from support.stand_ins import show
 
@@ -146,10 +147,8 @@ def test_json_lines_for_collectors(capsys: pytest.CaptureFixture[str]):
 
 def test_run_writes_them(tmp_path: Path):
     config = tmp_path / "c.yaml"
-    text = (ROOT / "configs" / "demo.yaml").read_text()
-    text = text.replace("gripper: grippers/", f"gripper: {ROOT}/configs/grippers/")
-    text = text.replace("enabled: true                      #", "enabled: false #")
-    config.write_text(text.replace("  enabled: true          #", "  enabled: false #"))
+    off = "{enabled: false}"
+    config.write_text(with_sections(shipped(), publish=off, recording=off))
     command = [sys.executable, "-m", "gripmon", "run", str(config), "--duration", "1", "--log-json"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=WAIT_S * 4)
     texts = [json.loads(line)["text"] for line in done.stderr.splitlines()]

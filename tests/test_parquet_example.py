@@ -11,8 +11,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 import yaml
+from support.configurations import shipped
 
-from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.config import load_config
 from gripmon.io.sources import make_simulator
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,10 +31,8 @@ def example() -> ModuleType:
 
 def run_monitor(folder: Path, robot: str, scenario: str) -> Path:
     """A monitor's recording below ``folder``; its configuration."""
-    shipped = builtin_config("demo.yaml")
-    values = yaml.safe_load(shipped.read_text())
+    values = yaml.safe_load(shipped())
     values["robot"] = robot
-    values["gripper"] = str(shipped.parent / values["gripper"])
     values["source"] |= {"scenario": scenario, "realtime": False, "ends": True, "fps": 20.0, "duration_s": 6.0}
     values["publish"] = {"enabled": False}
     config = folder / f"{robot}.yaml"

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.configurations import shipped
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
@@ -27,9 +28,8 @@ DEMO = builtin_config("demo.yaml")
 
 
 def with_setting(tmp_path: Path, setting: str) -> Path:
-    text = DEMO.read_text().replace("gripper: grippers", f"gripper: {DEMO.parent}/grippers")
     path = tmp_path / "config.yaml"
-    path.write_text(re.sub(r"^monitor:$", f"monitor:\n  {setting}", text, flags=re.MULTILINE))
+    path.write_text(shipped("demo.yaml", ("\nmonitor:\n", f"\nmonitor:\n  {setting}\n")))
     return path
 
 
@@ -223,10 +223,9 @@ def test_replay_warns_at_its_start(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_an_absolute_bound_says_in_a_line_if_the_reference_is_not_known_well_enough(
     tmp_path: Path, sigmas: tuple[float | None, float | None], policy: str, said: str | None
 ):
-    text = DEMO.read_text().replace("gripper: grippers/", f"gripper: {DEMO.parent}/grippers/")
     stated = zip(("position_sigma_m", "rotation_sigma_rad"), sigmas, strict=True)
     new = "".join(f"\n  {key}: {sigma}" for key, sigma in stated if sigma is not None)
-    text, count = re.subn(r"\n  position_sigma_m: .*\n  rotation_sigma_rad: .*", new, text)
+    text, count = re.subn(r"\n  position_sigma_m: .*\n  rotation_sigma_rad: .*", new, shipped())
     assert count == 1
     path = tmp_path / "config.yaml"
     path.write_text(text.replace("\nmonitor:\n", f"\nmonitor:\n  policy: {policy}\n"))
@@ -235,9 +234,7 @@ def test_an_absolute_bound_says_in_a_line_if_the_reference_is_not_known_well_eno
 
 
 def test_a_rate_of_zero_is_refused_with_what_would_be_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    text = DEMO.read_text().replace("gripper: grippers/", f"gripper: {DEMO.parent}/grippers/")
-    path = tmp_path / "config.yaml"
-    path.write_text(text.replace("\nmonitor:\n", "\nmonitor:\n  policy: {mount_jumps_per_month: 0}\n"))
+    path = with_setting(tmp_path, "policy: {mount_jumps_per_month: 0}")
     assert main(["check", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "monitor.policy.mount_jumps_per_month: is 0; a number >= 0.001 and <= 100000" in line

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from support.configurations import shipped
 
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
@@ -29,13 +30,12 @@ def test_a_recorded_configuration_is_the_configuration(path: Path, tmp_path: Pat
 
 
 def test_no_password_is_recorded(tmp_path: Path):
-    text = builtin_config("live_camera.yaml").read_text()
-    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
-    text = text.replace("device: 0 ", "device: 'rtsp://operator:sesame1@camera/1' # or sesame2")
-    text = text.replace("connect: [] ", "connect: ['tls/host:7447#password=sesame3'] ")
-    assert "sesame1" in text and "sesame3" in text
+    secrets = (
+        ("device: 0 ", "device: 'rtsp://operator:sesame1@camera/1' # or sesame2"),
+        ("connect: [] ", "connect: ['tls/host:7447#password=sesame3'] "),
+    )
     path = tmp_path / "live.yaml"
-    path.write_text(text)
+    path.write_text(shipped("live_camera.yaml", *secrets))
     recorded = msgspec.json.encode(to_recorded(load_config(path, check_source=False)))
     assert b"sesame" not in recorded and b"coefficients" in recorded
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-import yaml
+from support.configurations import demo_in
 from support.gripmon_process import gripmon
 from support.recorded import (
     Recorded,
@@ -23,7 +23,6 @@ from support.recorded import (
     wait_until,
 )
 
-from gripmon.daemon.config import builtin_config
 from gripmon.model.records import Alert, AlertKind, Cause, Severity
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.container import is_complete
@@ -51,16 +50,13 @@ def pictures(directory: Path) -> set[int]:
 
 def test_a_source_that_can_wait_loses_no_image(tmp_path: Path) -> None:
     """The monitor outruns an encoder of PNG; with a simulated camera that isn't in real time it waits."""
-    demo = builtin_config("demo.yaml")
-    monitor = yaml.safe_load(demo.read_text())
-    monitor |= {
-        "gripper": str(demo.parent / monitor["gripper"]),
-        "source": {"kind": "simulator", "scenario": "bump", "duration_s": 1.5, "fps": 20.0, "realtime": False},
-        "publish": {"enabled": False},
-        "recording": {"image_format": "png", "image_every": 1, "min_free_bytes": 0},
-    }
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(monitor))
-    done = gripmon("run", tmp_path / "config.yaml", "--out", tmp_path / "out", timeout_s=400.0)
+    config = demo_in(
+        tmp_path,
+        source={"kind": "simulator", "scenario": "bump", "duration_s": 1.5, "fps": 20.0, "realtime": False},
+        publish={"enabled": False},
+        recording={"image_format": "png", "image_every": 1, "min_free_bytes": 0},
+    )
+    done = gripmon("run", config, "--out", tmp_path / "out", timeout_s=400.0)
     assert done.returncode == 0 and "missing" not in done.stderr and "incomplete" not in done.stderr, done.stderr
     (run,) = open_recordings(sorted((tmp_path / "out").glob("*.rrd"))).recordings
     assert len(run.frames) == 30

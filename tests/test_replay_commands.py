@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import threading
@@ -15,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from support.configurations import shipped, with_sections
 from support.loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
 from support.network_daemon import ENVIRONMENT
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
-from gripmon.daemon.config import builtin_config
 from gripmon.judge.statefile import unpack
 
 PREFIX = "gripmon/demo/wrist"
@@ -27,18 +26,14 @@ PREFIX = "gripmon/demo/wrist"
 
 def configured(folder: Path, endpoint: str, **sections: str) -> Path:
     """The demo's configuration with other sections, each in braces."""
-    text = builtin_config("demo.yaml").read_text()
-    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
     sections = {
         "publish": f"{{listen: ['{endpoint}']}}",
         "recording": EVERY_FRAME,
         "source": "{kind: simulator, scenario: creep, duration_s: 6.0, fps: 30.0, realtime: false, ends: true}",
         **sections,
     }
-    for name, section in sections.items():
-        text = re.sub(rf"(?ms)^{name}:.*?(?=^\w|\Z)", "", text) + f"{name}: {section}\n"
     path = folder / "monitor.yaml"
-    path.write_text(text)
+    path.write_text(with_sections(shipped(), **sections))
     return path
 
 

@@ -15,6 +15,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 from support import recorded
+from support.configurations import with_sections
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.analyse.comparison import Differences
@@ -236,9 +237,9 @@ def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path,
     recording = tmp_path / "then.rrd"
     first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
     then = replayed(sequence, tmp_path / "then.jsonl", *first)
-    tight = "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0003}, recalibration: {mode: 'off'}}\n"
-    text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
-    (sequence / "tight.yaml").write_text(text + tight)
+    tight = "{policy: {warn_m: 0.0001, limit_m: 0.0003}, recalibration: {mode: 'off'}}"
+    text = with_sections((sequence / "config.yaml").read_text(), monitor=tight)
+    (sequence / "tight.yaml").write_text(text)
     capsys.readouterr()
     now = replayed(recording, tmp_path / "now.jsonl", "--config", str(sequence / "tight.yaml"))
     said = capsys.readouterr().err
@@ -267,12 +268,9 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     lines_then = replayed(
         sequence, tmp_path / "then.jsonl", "--config", str(sequence_config(sequence)), "--recording", str(then)
     )
-    text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
+    monitor = "{policy: {warn_m: 0.0001, limit_m: 0.0004, alert_limit_m: 0.001}, recalibration: {mode: 'off'}}"
     tight = sequence / "tight.yaml"
-    tight.write_text(
-        text
-        + "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004, alert_limit_m: 0.001}, recalibration: {mode: 'off'}}\n"
-    )
+    tight.write_text(with_sections((sequence / "config.yaml").read_text(), monitor=monitor))
     lines_now = replayed(then, tmp_path / "now.jsonl", "--config", str(tight), "--recording", str(both))
     shifts, scalars = "drift/tcp_shift_mm", "Scalars:scalars"
     for entity, lines in ((f"recorded/{shifts}", lines_then), (shifts, lines_now)):

@@ -16,10 +16,11 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.configurations import shipped
 
 from gripmon.analyse.content import Report
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.config import load_config
 from gripmon.io.sources import make_simulator
 from gripmon.simulate import Simulator
 
@@ -31,9 +32,7 @@ SECONDS, FPS = 12.0, 20.0
 def collision(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Simulator]:
     """A recording of a monitor on the demo's camera, every frame of it, and the truth."""
     folder = tmp_path_factory.mktemp("collision")
-    shipped = builtin_config("demo.yaml")
-    document: dict[str, Any] = yaml.safe_load(shipped.read_text())
-    document["gripper"] = str(shipped.parent / document["gripper"])
+    document: dict[str, Any] = yaml.safe_load(shipped())
     document["source"] |= {"realtime": False, "ends": True, "fps": FPS, "duration_s": SECONDS}
     document["publish"] = {"enabled": False}
     config = folder / "collision.yaml"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from support.configurations import demo_in
 from support.loopback import frame_record, state_record, wait_until
 
 from gripmon.cli import main
@@ -38,16 +39,6 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-
-
-def written(folder: Path, **sections: object) -> str:
-    """The demo's configuration with other sections, in a file."""
-    settings = yaml.safe_load(builtin_config("demo.yaml").read_text())
-    gripper = builtin_config("demo.yaml").parent / settings["gripper"]
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(settings | {"gripper": str(gripper)} | sections))
-    return str(path)
-
 
 CAMERA = {"kind": "ros2", "image": "/eye"}
 JOINTS = {"joint_states": "/joints", "opening": {"joints": ["finger"]}}
@@ -78,7 +69,7 @@ def test_settings_that_can_not_be(
     sections: dict[str, object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     sections = {"jaw": {"source": "fixed"}} | sections
-    assert main(["check", written(tmp_path, **sections)]) == 2
+    assert main(["check", str(demo_in(tmp_path, **sections))]) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1) and said in err
 
@@ -86,7 +77,7 @@ def test_settings_that_can_not_be(
 def test_an_earlier_configurations_router_is_told_and_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     from gripmon.daemon.config import load_config
 
-    config = load_config(written(tmp_path, ros2={"router": "tcp/127.0.0.1:7447", "node": "watch"}))
+    config = load_config(demo_in(tmp_path, ros2={"router": "tcp/127.0.0.1:7447", "node": "watch"}))
     assert config.settings.ros2 == Ros2Settings(node="watch")
     assert "ros2.router: rclpy finds ROS 2's nodes without it; remove the key" in caplog.text
 
@@ -114,7 +105,7 @@ def import_from(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], **sections: object) -> str:
     """The one line of check and of run."""
-    path, lines = written(tmp_path, **sections), []
+    path, lines = str(demo_in(tmp_path, **sections)), []
     for command in (["check", path], ["run", path, "--duration", "1"]):
         assert main(command) == 2
         lines.append(capsys.readouterr().err)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from support.configurations import shipped, with_sections
 from support.loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
 
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
 from gripmon.model.records import CommandReply, FrameRecord, from_json
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -23,16 +23,8 @@ PREFIX = "gripmon/demo/wrist"
 
 def configured(folder: Path, publish: str, *more: str) -> Path:
     """The demo's configuration, slower, with another section ``publish``."""
-    text = builtin_config("demo.yaml").read_text()
-    start = text.index("publish:")
-    end = text.index("\n\n", start) if "\n\n" in text[start:] else len(text)
-    text = f"{text[:start]}publish: {publish}{text[end:]}"
-    grippers = builtin_config("demo.yaml").parent / "grippers"
-    for before, after in (("gripper: grippers/", f"gripper: {grippers}/"), ("fps: 60.0", "fps: 10.0")):
-        assert text.count(before) == 1
-        text = text.replace(before, after)
-    path = folder / "here.yaml"
-    path.write_text("\n".join([text, *more]))
+    path, text = folder / "here.yaml", shipped("demo.yaml", ("fps: 60.0", "fps: 10.0"))
+    path.write_text("\n".join([with_sections(text, publish=publish), *more]))
     return path
 
 

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from support.configurations import shipped
 from support.simulated import STRONG_LENS
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
@@ -39,10 +40,11 @@ def test_the_best_mount_can_be_put_into_the_configuration(tmp_path: Path, capsys
     assert len(values["mounts"]) == 6
     best, present = values["mounts"][0], values["present"]
     assert best["works"] and smallest(best) < smallest(present)
-    text = DEMO.read_text().replace("gripper: grippers", f"gripper: {DEMO.parent}/grippers")
-    text = text.replace("[0.0004, 0.0014, 0.1188]", str(best["cam_T_grip"]["translation_m"]))
-    text = text.replace("[0.267184, 0.003984, -0.001105, 0.963637]", str(best["cam_T_grip"]["rotation_xyzw"]))
-    (tmp_path / "best.yaml").write_text(text)
+    changes = (
+        ("[0.0004, 0.0014, 0.1188]", str(best["cam_T_grip"]["translation_m"])),
+        ("[0.267184, 0.003984, -0.001105, 0.963637]", str(best["cam_T_grip"]["rotation_xyzw"])),
+    )
+    (tmp_path / "best.yaml").write_text(shipped("demo.yaml", *changes))
     assert main(["check", str(tmp_path / "best.yaml"), "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
     assert checked["reference"]["distance_m"] == pytest.approx(best["distance_m"])

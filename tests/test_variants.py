@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.box_models import cube_model, two_fingers_model
+from support.configurations import shipped
 from support.grippers import gripper_from_dict
 from support.simulated import BOX_FINGERS
 from support.watched import Watched, frames_of, new_monitor, watch
 
-from gripmon.daemon.config import ConfigError, builtin_config, load_config, read_gripper
+from gripmon.daemon.config import ConfigError, load_config, read_gripper
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import AlertKind, CornerFault, FrameRecord
 from gripmon.monitor import MonitorSettings
@@ -131,9 +132,7 @@ def test_a_recalibration_takes_its_own_selection(variant: str):
 
 
 def test_a_selection_without_effect_is_refused(tmp_path: Path):
-    text = builtin_config("demo.yaml").read_text()
-    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
-    path = tmp_path / "config.yaml"
+    text, path = shipped(), tmp_path / "config.yaml"
     path.write_text(text.replace("monitor:\n", "monitor:\n  update_corners: 4P\n"))
     with pytest.raises(ConfigError, match=r"monitor.update_corners: is 4P, but without effect"):
         load_config(path)

@@ -21,13 +21,13 @@ import pytest
 import rerun_cli
 from rerun.chunk import RrdReader
 from support import recorded
+from support.configurations import shipped, with_sections
 from support.gripmon_process import GRIPMON
 from support.headless import needs_chromium, picture_of
 from support.loopback import WAIT_S, free_endpoint, wait_until
 from support.network_daemon import ENVIRONMENT
 
 from gripmon.cli import main
-from gripmon.daemon.config import builtin_config
 from gripmon.record.files import FileSeries
 from gripmon.record.live import LiveStream
 from gripmon.record.recorder import Picture, RecordingSettings, Row, ViewSettings
@@ -77,18 +77,14 @@ def seqs_of(path: Path, entity: str = "record") -> set[int]:
 
 
 def monitor_config(folder: Path, port: int, web_port: int, recording: str) -> Path:
-    text = builtin_config("demo.yaml").read_text()
-    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
     sections = {
         "publish": "{enabled: false}",
         "source": "{kind: simulator, scenario: static, duration_s: 600.0, fps: 15.0, realtime: true}",
         "recording": recording,
         "view": f"{{port: {port}, web_port: {web_port}}}",
     }
-    for name, section in sections.items():
-        text = re.sub(rf"(?ms)^{name}:.*?(?=^\w|\Z)", "", text) + f"{name}: {section}\n"
     path = folder / "monitor.yaml"
-    path.write_text(text)
+    path.write_text(with_sections(shipped(), **sections))
     return path
 
 

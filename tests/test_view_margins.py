@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from support.configurations import shipped
 from support.meters import box_gripper, moved
 from support.simulated import STRONG_LENS, nominal_cam_T_grip
 
@@ -183,10 +184,8 @@ def test_check_tells_the_margins(capsys: pytest.CaptureFixture[str]):
 def test_check_says_where_the_jaws_leave_the_view_and_when_the_margin_is_small(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    demo = builtin_config("demo.yaml")
-    text = demo.read_text().replace("gripper: grippers", f"gripper: {demo.parent}/grippers")
     path = tmp_path / "near.yaml"
-    path.write_text(text.replace("[0.0004, 0.0014, 0.1188]", "[0.012, 0.0014, 0.06]"))
+    path.write_text(shipped("demo.yaml", ("[0.0004, 0.0014, 0.1188]", "[0.012, 0.0014, 0.06]")))
     assert main(["check", str(path), "--verbose"]) == 0
     said = capsys.readouterr().out
     assert "nothing can be measured from" in said and "outside of the image" in said

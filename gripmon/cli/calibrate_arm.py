@@ -16,8 +16,8 @@ from gripmon.cli.common import (
     positive_number,
     progress_bar,
     whole_number,
-    writing,
 )
+from gripmon.model.atomic import writing
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def laser(arguments: Arguments) -> None:
     written = found.document(provenance_of(arguments.command_line(), inputs, SEED))
     arguments.save("picture", found.picture)
     if arguments.recording is not None:
-        with writing(arguments.recording, "--recording"):
+        with writing(f"--recording {arguments.recording}"):
             write_calibration(arguments.recording, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
     if planned is not None:
         arguments.save("plan", plan_table(planned))

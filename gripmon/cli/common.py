@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from gripmon.model.atomic import writable_folder, write_atomically, writing
 from gripmon.model.errors import InputError
 from gripmon.model.project import Part, file_of
 from gripmon.model.units import jaw_opening_in, jaw_range_in
@@ -220,10 +221,8 @@ class Arguments(argparse.Namespace):
         if path is None:
             return
         made = content() if callable(content) else content
-        with writing(path, _option(name)):
+        with writing(f"{_option(name)} {path}"):
             if isinstance(made, bytes):
-                from gripmon.model.atomic import write_atomically
-
                 write_atomically(path, made)
             elif name == "picture":
                 import cv2
@@ -332,8 +331,6 @@ def announcer(verb: str) -> Callable[[str], None]:
 
 def make_directory(path: Path, option: str = "--out") -> Path:
     """Create a directory for output, which ``option`` names."""
-    from gripmon.model.atomic import writable_folder
-
     try:
         return writable_folder(path)
     except InputError as error:
@@ -342,17 +339,8 @@ def make_directory(path: Path, option: str = "--out") -> Path:
 
 def check_file(path: Path) -> None:
     """Refuse, before any work, a file that can't be written; it is created if missing, but not changed."""
-    with writing(path):
+    with writing(f"--out {path}"):
         path.open("ab").close()
-
-
-@contextmanager
-def writing(path: Path, option: str = "--out") -> Iterator[None]:
-    """Turn a fault of an output file into an error with exit code 2."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{option} {path}: can't be written ({error.strerror or error}); a file") from None
 
 
 @contextmanager

@@ -193,7 +193,8 @@ def from_images(arguments: Arguments) -> None:
     """
     import cv2
 
-    from gripmon.daemon.gripper_images import images_inputs, images_taken
+    from gripmon.daemon.calibrations import camera_in, pose_in
+    from gripmon.daemon.gripper_images import images_taken, openings_beside
     from gripmon.model.images import images_of_one_camera
     from gripmon.model.provenance import provenance_of
     from gripmon.teach.fingers import UnclearPartsError
@@ -203,12 +204,14 @@ def from_images(arguments: Arguments) -> None:
     cv2.setNumThreads(1)
     taken = images_taken(arguments.image)
     images = taken.images
-    given = images_inputs(images, arguments.camera, arguments.reference)
-    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys([*taken.files, *given.files])))
+    reference = None if arguments.reference is None else pose_in(arguments.reference)
+    camera, openings_m = camera_in(arguments.camera).lens, openings_beside(images)
+    files = [*taken.files, arguments.camera, *([] if reference is None else [arguments.reference])]
+    provenance = provenance_of(arguments.command_line(), list(dict.fromkeys(files)))
     try:
         found = gripper_from_images(
-            images, given.camera, openings_m=given.openings_m, distance_m=arguments.distance,
-            finger_width_m=arguments.finger_width, reference=given.reference, jaw_range_m=arguments.jaw_range,
+            images, camera, openings_m=openings_m, distance_m=arguments.distance,
+            finger_width_m=arguments.finger_width, reference=reference, jaw_range_m=arguments.jaw_range,
             fingers=arguments.fingers, within=arguments.within or (), name=arguments.name, provenance=provenance,
             response=arguments.response, progress=progress_bar,
         )  # fmt: skip

@@ -21,8 +21,8 @@ from gripmon.cli.common import (
     progress_bar,
     reading_bar,
     whole_number,
-    writing,
 )
+from gripmon.model.atomic import writing
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED, signals_exit
 
@@ -277,7 +277,7 @@ def _output(arguments: Arguments) -> Iterator[Callable[[bytes], None]]:
         file: Any = sys.stdout.buffer
     else:
         arguments.check_outputs("out")
-        with writing(path):
+        with writing(f"--out {path}"):
             file = path.open("wb")
 
     def put(act: Callable[..., object], *values: bytes) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from pathlib import Path
 
 from gripmon.io.sources import SourceError
-from gripmon.io.sources.files import COLUMNS, TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import COLUMNS, TIMESTAMPS_NAME, TableRow, read_table, table_of
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import CommandReply, to_json
@@ -42,21 +40,15 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     suffix = None if snapshot is None or snapshot.image is None else _SUFFIXES.get(snapshot.image.encoding)
     try:
         if image is not None and snapshot is not None and suffix is not None:
-            path, table = out / f"snapshot-{number}{suffix}", out / TIMESTAMPS_NAME
-            files = {path: image} | files
+            path, table, jaw_m = out / f"snapshot-{number}{suffix}", out / TIMESTAMPS_NAME, snapshot.jaw_reported_m
+            # An opening below zero is a closed jaw with a small error, which a table can't have.
+            jaw_m = jaw_m if jaw_m is not None and 0.0 <= jaw_m <= 1.0 else None
+            row = TableRow(max(snapshot.record.stamp_ns, 0), jaw_m)
+            rows = read_table(table) if table.exists() else {}
             # Written last, since it names the image.
-            files[table] = _with_row(table, path.name, snapshot.record.stamp_ns, snapshot.jaw_reported_m)
+            files = {path: image} | files | {table: table_of({**rows, path.name: row})}
         for path, data in files.items():
             write_atomically(path, data)
     except OSError as error:
         raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "out") from None
     return list(files)
-
-
-def _with_row(table: Path, name: str, stamp_ns: int, jaw_m: float | None) -> bytes:
-    text = io.StringIO()
-    lines = csv.writer(text, lineterminator="\n")
-    before = table.read_text(encoding="utf-8-sig") if table.exists() else ",".join(COLUMNS)
-    # An opening below zero is a closed jaw with a small error, which a table can't have.
-    lines.writerow((name, max(stamp_ns, 0), repr(jaw_m) if jaw_m is not None and 0.0 <= jaw_m <= 1.0 else ""))
-    return f"{before.rstrip()}\n{text.getvalue()}".encode()

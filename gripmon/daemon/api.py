@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gripmon import monitor
 from gripmon.daemon.config import Config, ConfigError
+from gripmon.daemon.config.typed import faults_of
 from gripmon.io.sources import (
     EpisodeSettings,
     FolderSettings,
@@ -18,7 +19,6 @@ from gripmon.io.sources import (
     OpenedSource,
     SimulatedSettings,
     Source,
-    SourceError,
     SourceSettings,
     VideoSettings,
     settings_for_path,
@@ -86,10 +86,8 @@ def open_configured(config: Config, link: Link | None = None) -> Source:
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
     keys = Keys(settings.robot, settings.camera_name)
     scene = config.scene if isinstance(settings.source, SimulatedSettings) else None  # others don't need its packages
-    try:
+    with faults_of(config.path, "source."):
         source = start(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
-    except SourceError as error:
-        raise ConfigError(config.path, "", f"source.{error}") from None
     bit_depth = settings.monitor.bit_depth
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 

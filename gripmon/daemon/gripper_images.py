@@ -9,9 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gripmon.daemon.calibrations import camera_in, pose_in
 from gripmon.io.sources.files import TIMESTAMPS_NAME, VideoSettings, VideoSource, opening_beside
-from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, NamedImage, image_paths, natural_key
 from gripmon.model.records import Array, Image
@@ -24,18 +22,6 @@ average to less."""
 CHANGED_SHARE = 0.05
 """Least part of the image that shows another thing than the frame before, for another view.  The same view again would
 count as another background that agrees."""
-
-
-@dataclass(frozen=True)
-class ImagesInputs:
-    """The ``camera``; the jaw opening in each image (m), None without tables; the reference ``cam_T_grip`` (4, 4) with
-    its covariance (6, 6), if one is given; the ``files`` that were read.
-    """
-
-    camera: LensSettings
-    openings_m: list[float | None] | None
-    reference: tuple[Array, Array] | None
-    files: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -105,16 +91,10 @@ def _small(image: Image) -> Array:
     return np.asarray(small.mean(axis=2) if small.ndim == 3 else small)
 
 
-def images_inputs(images: Sequence[Path | NamedImage], camera: Path, reference: Path | None) -> ImagesInputs:
-    """Read the files; openings come from a ``timestamps.csv`` beside each image file, if there is one.
+def openings_beside(images: Sequence[Path | NamedImage]) -> list[float | None] | None:
+    """The jaw opening in each image (m), from a ``timestamps.csv`` beside each image file; None without any.
     :class:`~gripmon.model.errors.InputError`.
     """
-    files = [camera, *([] if reference is None else [reference])]
-    pose = None if reference is None else pose_in(reference)
-    return ImagesInputs(camera_in(camera).lens, _openings(images), pose, tuple(files))
-
-
-def _openings(images: Sequence[Path | NamedImage]) -> list[float | None] | None:
     openings = [opening_beside(image) if isinstance(image, Path) else None for image in images]
     if all(opening is None for opening in openings):
         return None

@@ -6,16 +6,17 @@ import contextlib
 import dataclasses
 import logging
 
-from gripmon.daemon.config import Config, ConfigError, check_network
+from gripmon.daemon.config import Config, check_network
+from gripmon.daemon.config.typed import faults_of
 from gripmon.daemon.neighbours import Asked, Commands, JawFeed, Reports
-from gripmon.io.metrics import MetricsError, MetricsServer
+from gripmon.io.metrics import MetricsServer
 from gripmon.io.publish.commands import ZenohCommands
 from gripmon.io.publish.inputs import ZenohJaw
 from gripmon.io.publish.presence import Presence, in_words
 from gripmon.io.publish.publisher import ZenohPublisher
 from gripmon.io.ros2.output import Ros2Output
 from gripmon.io.sources import ArrivingCamera, Source
-from gripmon.io.wire import Keys, Link, PublishError
+from gripmon.io.wire import Keys, Link
 from gripmon.model.errors import NoResultError
 from gripmon.model.outputs import Output
 
@@ -88,10 +89,8 @@ class Network:
 
     def _join(self, config: Config, *, take_over: bool) -> None:
         settings, reports = config.settings, self.reports
-        try:
+        with faults_of(config.path):
             self.link = link = Link(settings.publish, config.directory)
-        except PublishError as error:
-            raise ConfigError(config.path, "", str(error)) from None
         presence = _alone(link, settings.robot, settings.camera_name, take_over=take_over)
         publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
         self.outputs.append(publisher)
@@ -109,10 +108,8 @@ class Network:
     def _serve_metrics(self, config: Config) -> None:
         """For Prometheus.  Raises :class:`ConfigError` if the server can't listen."""
         settings = config.settings
-        try:
+        with faults_of(config.path):
             self.outputs.append(MetricsServer(settings.metrics, settings.robot, settings.camera_name))
-        except MetricsError as error:
-            raise ConfigError(config.path, "", str(error)) from None
         _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
 
 

@@ -16,6 +16,7 @@ import msgspec
 from gripmon.analyse.comparison import Differences
 from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
+from gripmon.model.atomic import writing
 from gripmon.model.errors import InputError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
 from gripmon.record.keeping import keep_whole
@@ -139,10 +140,8 @@ def one_recording(path: Path | None, config: Config, run: RecordedRun | None = N
         config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
     )
     with contextlib.ExitStack() as opened:
-        try:
+        with writing(path, "recording"):
             scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
-        except OSError as error:
-            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
         recorder = open_recorder(
             settings,
             robot=config.settings.robot,

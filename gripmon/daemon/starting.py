@@ -20,14 +20,15 @@ from gripmon.daemon.api import Monitor, look_ahead, open_configured, unlike_ligh
 from gripmon.daemon.config import Config, ConfigError, load_config
 from gripmon.daemon.config.checks import reference_doubt
 from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.config.typed import faults_of
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.network import Network
 from gripmon.daemon.running import run
 from gripmon.daemon.service import log_to_stderr
 from gripmon.io.sources import Source
-from gripmon.judge.statefile import StateFile, StateFileError
-from gripmon.model.atomic import writable_folder
+from gripmon.judge.statefile import StateFile
+from gripmon.model.atomic import writable_folder, writing
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Array, Cause, MonitorState, Outlines, Severity
 from gripmon.model.stopping import StopRequest
@@ -75,10 +76,8 @@ def run_file(path: Path, options: RunOptions, *, verbose: bool = False, log_json
     look_ahead(config)
     if options.out is not None:
         lines = writable_folder(options.out) / "estimates.jsonl"
-        try:
+        with writing(lines, "out"):
             lines.open("ab").close()
-        except OSError as error:
-            raise InputError(f"{lines}: can't be written ({error.strerror}); a file", "out") from None
     log_to_stderr(verbose=verbose, as_json=log_json)
     return run_monitor(config, options)
 
@@ -174,10 +173,8 @@ def _open_state(config: Config, opened: contextlib.ExitStack, *, fresh: bool) ->
     path = config.state_path
     if path is None:
         return None
-    try:
+    with faults_of(config.path, "state.file: "):
         kept = StateFile(path, config.state_owner, config.reference, fresh=fresh)
-    except StateFileError as error:
-        raise ConfigError(config.path, "state.file", str(error)) from None
     opened.callback(kept.close)
     if kept.configured.revision != config.reference.revision:
         # The file that knew the revisions was set aside, and what follows may fail, e.g. opening the camera.

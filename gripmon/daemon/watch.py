@@ -31,6 +31,14 @@ _UPDATE_S = 10.0
 """Pause between updates of a failure's text; another reason is reported at once, other figures are not."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 _OTHERS, _DROPS = "others", "drops"
+_TOPICS = {
+    _OUTPUT: (AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, "all outputs accept messages again"),
+    _FAILURE: (AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, "frames are processed again"),
+    _RECORDING: (AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, "recording continues"),
+    _DROPS: (AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, "the monitor keeps up with the camera again"),
+    _OTHERS: (AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, "no other monitor has this name any more"),
+}
+"""By topic the alert while something is wrong, and what is said when nothing is any more."""
 
 DROP_WINDOW_S = 10.0
 """Dropped frames are counted over this time; the first slow seconds after a start don't matter."""
@@ -172,43 +180,33 @@ class Watch:
         """
         self.undelivered = undelivered
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
-        if undelivered:
-            silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
-            alerts = self._fails(_OUTPUT, silent, now_s, stamp_ns)
-        else:
-            alerts = list(self._alerts.absent(_OUTPUT, "all outputs accept messages again", now_s))
-        if not failure:
-            return [*alerts, *self._alerts.absent(_FAILURE, "frames are processed again", now_s)]
-        self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
-        failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
-        return [*alerts, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
+        if failure:
+            self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
+        outputs = self._said(_OUTPUT, undelivered, now_s, stamp_ns, news=True)
+        return [*outputs, *self._said(_FAILURE, failure, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or drops data, as ``failure`` says; the monitor continues."""
-        if failure is None:
-            return list(self._alerts.absent(_RECORDING, "recording continues", now_s))
-        stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
-        return self._fails(_RECORDING, stopped, now_s, stamp_ns)
-
-    def _fails(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> list[Alert]:
-        """Alerts about a failure, also when it now has another reason."""
-        before = self._alerts.about(topic)
-        news = before is not None and kind_of(before.text) != kind_of(alert.text)
-        return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
+        return self._said(_RECORDING, failure or "", now_s, stamp_ns, news=True)
 
     def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
         """``count``: frames dropped since the start because another one was being processed."""
-        if not (text := self._drops.look(self.frames, count, now_s)):
-            return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
-        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, text)
-        return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
+        return self._said(_DROPS, self._drops.look(self.frames, count, now_s), now_s, stamp_ns)
 
     def others(self, text: str, now_s: float, stamp_ns: int) -> list[Alert]:
         """``text``: about other monitors with this name, empty while there are none."""
+        return self._said(_OTHERS, text, now_s, stamp_ns)
+
+    def _said(self, topic: str, text: str, now_s: float, stamp_ns: int, *, news: bool = False) -> list[Alert]:
+        """The alert that is due while something is wrong, as ``text`` says, and once when nothing is any more (empty);
+        ``news``: also when it now has another reason.
+        """
+        kind, cause, severity, over = _TOPICS[topic]
         if not text:
-            return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
-        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, text)
-        return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
+            return list(self._alerts.absent(topic, over, now_s))
+        before = self._alerts.about(topic)
+        news = news and before is not None and kind_of(before.text) != kind_of(text)
+        return list(self._alerts.present(topic, Alert(kind, cause, severity, text), now_s, stamp_ns, news=news))
 
     def stopped(self) -> None:
         """The end: a reader of the last state message must not continue to trust the last transform."""

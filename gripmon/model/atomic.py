@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -22,6 +21,15 @@ def writable_folder(path: Path, argument: str = "out") -> Path:
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{path}: may not be written to; a directory of your own", argument)
     return path
+
+
+@contextlib.contextmanager
+def writing(file: object, argument: str = "") -> Iterator[None]:
+    """Turn a fault of a file that is written into :class:`InputError`, about ``argument`` if that is given."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{file}: can't be written ({error.strerror or error}); a file", argument) from None
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -42,7 +50,7 @@ def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
         with path.open("wb") as file:
             yield file
         return
-    name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
+    name = path.with_name(f".{path.name}-{os.urandom(4).hex()}.tmp")
     # Use the mode of any new file: mkstemp's is narrower, and the umask can't be read without changing it.
     descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:

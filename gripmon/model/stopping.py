@@ -1,9 +1,8 @@
-"""Stopping: SIGINT and SIGTERM, from the first import to the last file closed, and the end of a parent process."""
+"""Stopping: SIGINT and SIGTERM, from the first import to the last file closed."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 import threading
@@ -79,22 +78,6 @@ def signals_request(stop: StopRequest) -> Iterator[None]:
     """For a loop that polls ``stop``: nothing is raised."""
     with _handling(lambda number, _frame: _take(stop, number)):
         yield
-
-
-def end_with_parent() -> None:
-    """In a worker that :mod:`multiprocessing` spawned: exit when the parent ends, even if it was killed by SIGKILL or
-    for lack of memory.  Otherwise the worker would wait for work forever and keep all of its memory.
-    """
-    from multiprocessing import parent_process  # heavy, and the command line imports this module
-
-    parent = parent_process()
-    assert parent is not None, "only a spawned process has a parent to follow"
-
-    def follow() -> None:
-        parent.join()
-        os._exit(EXIT_FAILED)
-
-    threading.Thread(target=follow, name="parent", daemon=True).start()
 
 
 def _take(stop: StopRequest, number: int) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.judge.references import ReferenceBook
@@ -14,6 +13,7 @@ from gripmon.judge.statefile import StateFile
 from gripmon.model.geometry import from_record
 from gripmon.model.records import MonitorState
 from gripmon.simulate import Rig, make_scenario
+from support.configurations import demo_in
 
 DIFFERENT = 12
 """Pictures of one place: so many that one that comes again is not taken for a frozen camera's."""
@@ -41,10 +41,7 @@ def make_pictures(folder: Path, frames: int, *, knocked_every: int | None = None
 
 def configuration(folder: Path, pictures: Path, endpoint: str, **more: object) -> Path:
     """The demo's camera and gripper on these pictures, a state file ``kept.json``, a client of a router."""
-    demo = builtin_config("demo.yaml")
-    settings = yaml.safe_load(demo.read_text())
-    settings |= {
-        "gripper": str(demo.parent / settings["gripper"]),
+    sections = {
         "source": {"kind": "folder", "path": str(pictures), "fps": 60.0},
         "jaw": {"source": "fixed"},
         "publish": {"mode": "client", "connect": [endpoint]},
@@ -52,9 +49,7 @@ def configuration(folder: Path, pictures: Path, endpoint: str, **more: object) -
         "state": {"file": "kept.json"},
         **more,
     }
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(settings))
-    return path
+    return demo_in(folder, **sections)
 
 
 def keep(path: Path, *moved_m: float) -> MonitorState:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from support.configurations import with_sections
 from support.loopback import WAIT_S, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,12 +21,10 @@ def network_config(
     folder: Path, publish: str, *, source: str = "{kind: zenoh}", jaw: str = "{source: frames}", name: str = "network"
 ) -> Path:
     """A sequence's configuration with other sections; ``publish`` is that section in braces."""
-    text = (folder / "config.yaml").read_text()
-    for section in ("source", "jaw"):
-        text = re.sub(rf"(?ms)^{section}:.*?(?=^\w|\Z)", "", text)
-    text += f"source: {source}\njaw: {jaw}\npublish: {publish}\nrecording: {{enabled: false}}\nstate: {{file: null}}\n"
+    own = {"recording": "{enabled: false}", "state": "{file: null}"}
     path = folder / f"{name}.yaml"
-    path.write_text(text)
+    text = (folder / "config.yaml").read_text()
+    path.write_text(with_sections(text, source=source, jaw=jaw, publish=publish, **own))
     return path
 
 

@@ -9,6 +9,7 @@ import math
 import multiprocessing
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -19,7 +20,6 @@ from scipy import stats
 from tqdm import tqdm
 
 from benchmarks import machine
-from gripmon.model.stopping import end_with_parent
 
 CONFIDENCE = 0.95
 _VERDICTS = {True: "met", False: "MISSED", None: "not judged"}
@@ -214,10 +214,18 @@ def in_new_process(function: Callable[..., _T], *arguments: Any) -> _T:
 def _begin(prepare: Callable[[], object] | None) -> None:
     import cv2
 
-    end_with_parent()
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     cv2.setNumThreads(1)
     if prepare is not None:
         prepare()
+
+
+def _end_with_parent() -> None:
+    """A worker would wait for work for ever if its parent was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "only a spawned process has one"
+    parent.join()
+    os._exit(1)
 
 
 def _quiet() -> None:

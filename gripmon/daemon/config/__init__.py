@@ -34,7 +34,7 @@ from gripmon.io.wire import Joining
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record
-from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
+from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperModel, TableMotion
 from gripmon.model.project import file_of
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.track.edges import TaughtEdges, TaughtModel
@@ -223,10 +223,7 @@ def read_gripper(gripper_path: Path) -> Gripper:
             for form, motion in (("axis", AxisMotion), ("table", TableMotion)):
                 if finger.motion is not None and set(finger.motion) == {form}:
                     to_settings(finger.motion, motion, f"fingers.{name}.motion")
-    try:
         return Gripper(model)
-    except GripperError as error:
-        raise ConfigError(gripper_path, "", str(error)) from None
 
 
 def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: CalibrationFiles) -> ReferenceRecord:

@@ -28,7 +28,7 @@ from gripmon.io.sources import (
     VideoSettings,
 )
 from gripmon.io.sources.live import backend_number
-from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
+from gripmon.io.wire import Joining, PublishSettings, joining
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
@@ -247,15 +247,12 @@ def _opening_fault(jaw: JawSettings, gripper: Gripper) -> Fault | None:
 
 
 def joined(settings: Settings, directory: Path) -> Joining | None:
-    """How the network would be joined; None if it won't be.  :class:`SettingsError` if it can't be."""
+    """How the network would be joined; None if it won't be.  :class:`InputError` if it can't be."""
     if (missing := package_fault(settings.metrics)) is not None:
         raise SettingsError(Fault(*missing))
     if (fault := _ros2_missing(settings)) is not None:
         raise SettingsError(fault)
-    try:
-        return joining(settings.publish, directory) if settings.publish.enabled else None
-    except PublishError as error:
-        raise SettingsError(Fault("", str(error), "")) from None
+    return joining(settings.publish, directory) if settings.publish.enabled else None
 
 
 def _ros2_missing(settings: Settings) -> Fault | None:

@@ -54,11 +54,17 @@ class ConfigError(InputError):
 
 @contextmanager
 def faults_of(path: Path, prefix: str = "") -> Iterator[None]:
-    """A :class:`SettingsError` in it is a :class:`ConfigError` of this file, at a key below ``prefix``."""
+    """An :class:`InputError` in it is a :class:`ConfigError` of this file, at a key below ``prefix``; one that names a
+    file stays as it is.
+    """
     try:
         yield
+    except ConfigError:
+        raise
     except SettingsError as error:
         raise ConfigError(path, f"{prefix}{error.fault.key}", error.fault.wrong, error.fault.right) from None
+    except InputError as error:
+        raise ConfigError(path, "", f"{prefix}{error}") from None
 
 
 def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:

@@ -17,8 +17,7 @@ from gripmon import __version__
 from gripmon.daemon.config import Config, load_config
 from gripmon.daemon.config.settings import ReferenceSettings, Settings, TransformSettings
 from gripmon.daemon.config.yaml_file import lines_of
-from gripmon.model.atomic import write_atomically
-from gripmon.model.errors import InputError
+from gripmon.model.atomic import write_atomically, writing
 from gripmon.model.fields import described
 from gripmon.model.records import Transform
 from gripmon.model.yaml_text import plain_value
@@ -95,10 +94,8 @@ def name_taught(config: Config, taught: Path) -> Config:
     Raises :class:`~gripmon.model.errors.InputError` where it can't be written.
     """
     if config.taught_path is None:
-        try:
+        with writing(config.path):
             write_atomically(config.path, with_taught(config.path, taught).encode())
-        except OSError as error:
-            raise InputError(f"{config.path}: can't be written ({error.strerror or error}); a file") from None
     return load_config(config.path, check_source=False)
 
 

@@ -5,11 +5,10 @@ grow with the dataset, and return rows for each, also for one that kills its wor
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -17,7 +16,7 @@ from gripmon.daemon.config import Config
 from gripmon.daemon.dataset.measuring import Rows, failed, measure
 from gripmon.io.sources.episodes import Episode
 from gripmon.model.errors import InputError, one_line
-from gripmon.model.stopping import end_with_parent
+from gripmon.model.own_process import OwnProcess
 
 ENGINES = ("local", "ray")
 WORKER_EPISODES = 200
@@ -38,28 +37,23 @@ class _Worker:
     """A process that measures one episode at a time."""
 
     def __init__(self, config: Config, lens: str, work: Measuring) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, config, lens, work), daemon=True)
-        self.process.start()
-        theirs.close()  # so that the end of the process is the end of the connection
+        self.connection, theirs = Pipe()
+        with theirs:  # so that the end of the process is the end of the connection
+            self.process = OwnProcess(_serve, theirs.fileno(), config, lens, work, inherits=(theirs.fileno(),))
         self.began, self.measured = False, 0
 
     def end(self) -> None:
         """End the process, whatever it does, and wait until it has ended."""
-        self.process.terminate()
-        self.process.join()
+        self.process.end()
         self.connection.close()
 
 
-def _serve(connection: Connection, config: Config, lens: str, work: Measuring) -> None:
+def _serve(descriptor: int, config: Config, lens: str, work: Measuring) -> None:
     import cv2
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, which ends its workers
-    end_with_parent()
     cv2.setNumThreads(1)
-    connection.send(None)
-    with contextlib.suppress(EOFError):
+    with contextlib.suppress(EOFError, OSError), Connection(descriptor) as connection:  # until the driver ends
+        connection.send(None)
         while True:
             connection.send(work(config, connection.recv(), lens))
 
@@ -93,7 +87,7 @@ def local(
                 except (EOFError, OSError):
                     worker.end()
                     if not worker.began:
-                        text = f"a process can't begin (exit code {worker.process.exitcode}); what it wrote is above"
+                        text = f"a process can't begin (exit code {worker.process.returncode}); what it wrote is above"
                         raise InputError(text, "engine") from None
                     tries[episode.key] += 1
                     rows = failed(config, episode, DIED) if tries[episode.key] >= TRIES else None

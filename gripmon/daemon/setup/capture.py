@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from gripmon.calibrate.grey_levels import to_bytes, to_grey
 from gripmon.calibrate.sighting import Sighting
 from gripmon.daemon.setup.views import MOVED_PX, Coverage, View, Viewer, coverage, moved
 from gripmon.io.sources import Source, Waiting
-from gripmon.io.sources.files import COLUMNS, TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, TableRow, read_table, table_of
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image
@@ -118,7 +116,9 @@ class Capture:
         with self._lock:
             (self.folder / name).unlink(missing_ok=True)
             self._seen.pop(name, None)
-            self._write_rows({n: row for n, row in self._rows().items() if n != name})
+            rows = self._rows()
+            if rows.pop(name, None) is not None:
+                self._write_rows(rows)
 
     def images(self) -> tuple[str, ...]:
         """Names, in the order of capture."""
@@ -244,7 +244,7 @@ class Capture:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self.folder / name, data)
             if frame.jaw_opening_m is not None:
-                self._write_rows(self._rows() | {name: (str(max(frame.stamp_ns, 0)), repr(frame.jaw_opening_m))})
+                self._write_rows(self._rows() | {name: TableRow(max(frame.stamp_ns, 0), frame.jaw_opening_m)})
         except OSError as error:
             raise BadRequest(f"{self.folder / name}: can't be written ({error.strerror or error})") from None
         self._last_taken = to_bytes(to_grey(frame.image))
@@ -252,19 +252,11 @@ class Capture:
             self._seen[name] = view.sighting
         return name
 
-    def _rows(self) -> dict[str, tuple[str, str]]:
+    def _rows(self) -> dict[str, TableRow]:
         """Rows of the table beside the images."""
-        table: dict[str, tuple[str, str]] = {}
         with contextlib.suppress(InputError):
-            for name, row in read_table(self.folder / TIMESTAMPS_NAME).items():
-                table[name] = str(row.stamp_ns), "" if row.jaw_opening_m is None else repr(row.jaw_opening_m)
-        return table
+            return read_table(self.folder / TIMESTAMPS_NAME)
+        return {}
 
-    def _write_rows(self, rows: dict[str, tuple[str, str]]) -> None:
-        if not rows and not (self.folder / TIMESTAMPS_NAME).exists():
-            return
-        text = io.StringIO()
-        lines = csv.writer(text, lineterminator="\n")
-        lines.writerow(COLUMNS)
-        lines.writerows((name, *row) for name, row in rows.items())
-        write_atomically(self.folder / TIMESTAMPS_NAME, text.getvalue().encode())
+    def _write_rows(self, rows: dict[str, TableRow]) -> None:
+        write_atomically(self.folder / TIMESTAMPS_NAME, table_of(rows))

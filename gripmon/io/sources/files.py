@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import logging
 import math
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -116,6 +118,16 @@ def read_table(path: Path) -> dict[str, TableRow]:
         return _rows(path, lines)
     except csv.Error as error:
         raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
+
+
+def table_of(rows: Mapping[str, TableRow]) -> bytes:
+    """The text of such a table, with a column for the openings."""
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(COLUMNS)
+    for name, row in rows.items():
+        lines.writerow((name, row.stamp_ns, "" if row.jaw_opening_m is None else repr(row.jaw_opening_m)))
+    return text.getvalue().encode()
 
 
 def opening_beside(path: Path) -> float | None:
