@@ -78,7 +78,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     window = np.minimum(CORNER_RADIUS, 1.3 * margin) * steps - (1.0 if 1.3 * margin < CORNER_RADIUS else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
-    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"], 1)
+    return _sighting(grey, uv_px, plate[ids], covariance, good, 0.0, name, note, FEWEST["charuco"], 1)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
@@ -104,7 +104,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
     fewest = FEWEST["chequerboard"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, fewest, turns)
+    return _sighting(grey, uv_px, plate, covariance, good, 0.0, name, note, fewest, turns)
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
@@ -135,7 +135,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     turns = turns_alike(target) if _whole(places, *(last + 1 for last in target.last)) else 0
     radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), len(target.places), blur_px)
     fewest = FEWEST["circles"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, fewest, turns)
+    return _sighting(grey, uv_px, plate, covariance, good, radius_m, name, note, fewest, turns)
 
 
 def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGrid) -> NDArray[np.intp] | NotFound:
@@ -172,7 +172,6 @@ def _sighting(
     uv_px: Array,
     plate_m: Array,
     covariance: Array,
-    ids: NDArray[np.intp],
     good: NDArray[np.bool_],
     radius_m: float,
     name: str,
@@ -183,7 +182,7 @@ def _sighting(
     if good.sum() < fewest:
         return NotFound(f"{int(good.sum())} points of the target are sharp and free; at least {fewest}")
     size = (grey.shape[1], grey.shape[0])
-    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note, turns)
+    return Sighting(uv_px[good], plate_m[good], covariance[good], size, radius_m, name, note, turns)
 
 
 def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
@@ -203,11 +202,6 @@ def _turned(cells: NDArray[np.intp], columns: int, rows: int) -> NDArray[np.intp
     if seen_columns <= columns and seen_rows <= rows and (seen_columns, seen_rows) != (rows, columns):
         return cells
     out: NDArray[np.intp] = np.stack([cells[:, 1], cells[:, 0].max() - cells[:, 0]], axis=1)
-    return out
-
-
-def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
-    out: NDArray[np.intp] = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
     return out
 
 
