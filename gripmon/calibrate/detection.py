@@ -85,9 +85,9 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     found = chequers.find_corners(grey, target.columns, target.rows)
     if not found:
         return NotFound(_blurred(grey) or "no chequerboard in the image; one that is evenly lit and not too small")
-    cells, rough = _arrays(found[0])
+    cells, rough = _arrays(found)
     fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
-    if fewer or not fits(found[0], target.columns, target.rows, least=2):
+    if fewer or not fits(found, target.columns, target.rows, least=2):
         return _wrong_count(cells, target.columns, target.rows, "inner corners", fewer)
     steps = _steps(cells, rough)
     starts, ends = _across_squares(cells, rough)
@@ -113,7 +113,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     if not found:
         none = "no lattice of discs in the image; one that is evenly lit and not too small"
         return NotFound(_staggered(grey, target) or _blurred(grey) or none)
-    cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
+    cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found.items()})
     places = _places(grey, cells, rough, target)
     if isinstance(places, NotFound):
         return places
@@ -126,7 +126,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(steps)):
         return NotFound(_too_coarse(blur_px, steps))
     noise = noise_of(grey)
-    first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
+    first = {(c - min(x for x, _ in found), r - min(y for _, y in found)): d for (c, r), d in found.items()}
     centres = [refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
     good = np.array([centre is not None for centre in centres])
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
@@ -161,9 +161,9 @@ def _staggered(grey: Grey, target: CircleGrid) -> str:
     staggered = StaggeredCircles(target.columns, target.rows, target.spacing_m, target.diameter_m)
     (columns, rows), step_m = lattice_of(staggered)
     found = find_discs(grey, columns, rows, step_m / target.diameter_m, len(staggered.places))
-    if not found or len(found[0]) <= _MOST_OF * len(staggered.places):
+    if not found or len(found) <= _MOST_OF * len(staggered.places):
         return ""
-    places = places_of(np.array(list(found[0]), np.intp), staggered)
+    places = places_of(np.array(list(found), np.intp), staggered)
     return "" if places is None else f"the discs are staggered (asymmetric circles); --target {name_of(staggered)}"
 
 
