@@ -240,17 +240,18 @@ def _sharp(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Sub-pixel corners (n, 2) at lattice coordinates ``cells`` (n, 2), covariances (n, 2, 2), and which are good."""
     noise = noise_of(grey)
-    found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
-    good = _corners(grey, *found, radius_px)
+    first, _, asymmetry = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
+    good = _corners(grey, first, asymmetry, radius_px)
     # The bend of the lattice is known once its corners are.
     bend = np.zeros((len(rough), 3, 2))
     size = (grey.shape[1], grey.shape[0])
-    bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
-    found = chequers.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
-    return found[0], found[1], _corners(grey, *found, radius_px)
+    bend[good] = bends(np.asarray(cells[good], np.float64), first[good], size)
+    starts = np.where(good[:, None], first, rough)
+    uv_px, covariance, asymmetry = chequers.centres_of_symmetry(grey, starts, radius_px, noise, bend)
+    return uv_px, covariance, _corners(grey, uv_px, asymmetry, radius_px)
 
 
-def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
+def _corners(grey: Grey, uv_px: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
     """(n,) which points are corners and not occluded."""
     radius = np.clip(radius_px, chequers.SMALLEST_RADIUS_PX, chequers.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])
