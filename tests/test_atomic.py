@@ -20,8 +20,6 @@ OTHERWISE = {
     "daemon/starting.py",  # whether lines can be written there
     "cli/look_back.py",
     "cli/common.py",
-    "record/compared.py",  # a part that becomes the result
-    "analyse/corrected.py",
     "daemon/simulated.py",  # folders that were empty before
     "simulate/sequence.py",
     "simulate/calibration_images.py",

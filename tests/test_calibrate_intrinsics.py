@@ -300,7 +300,7 @@ def test_too_few_points():
 def test_views_are_doubted_from_stated_limits_on(reach: float, lost: int, rms_share: float, said: list[str]):
     """Reach in parts of the half diagonal, 400 px; residuals in parts of the width."""
     uv_px = np.array([320.0, 240.0]) + np.linspace(0.0, 400.0 * reach, 100)[:, None] * [0.8, 0.6]
-    sighting = Sighting(uv_px, np.zeros((100, 3)), np.tile(np.eye(2), (100, 1, 1)), np.arange(100), (640, 480))
+    sighting = Sighting(uv_px, np.zeros((100, 3)), np.tile(np.eye(2), (100, 1, 1)), (640, 480))
     result = SimpleNamespace(
         target=None,
         camera=SimpleNamespace(width_px=640, height_px=480, fx_px=700.0),

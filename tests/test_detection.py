@@ -75,7 +75,7 @@ def test_corners_are_found_where_they_are(condition: str):
     assert len(sight) >= least
     assert np.sqrt(np.mean(distance**2) / 2.0) < 2.0 * rms_px and distance.max() < 0.3
     assert sight.note == ("" if len(sight) == 54 else f"{len(sight)} of 54 points")
-    assert len(set(sight.ids.tolist())) == len(sight)
+    assert len(set(map(tuple, sight.plate_m.tolist()))) == len(sight)
 
 
 def test_the_stated_covariance_follows_the_noise():
@@ -85,7 +85,7 @@ def test_the_stated_covariance_follows_the_noise():
         for seed in range(3):
             image = render(LENS, HELD, BOARD, Look(supersampling=3, noise=noise, clutter="plain"), seed=seed)
             errors.append(found_in(image))
-        a, b, c = ({int(i): s.uv_px[k] for k, i in enumerate(s.ids)} for s in errors)
+        a, b, c = (dict(zip(map(tuple, s.plate_m.tolist()), s.uv_px, strict=True)) for s in errors)
         shared = sorted(set(a) & set(b) & set(c))
         scatter = np.std([[d[i] for i in shared] for d in (a, b, c)], axis=0, ddof=1)
         stated = np.sqrt(np.mean([np.trace(s.covariance_px.mean(axis=0)) / 2.0 - 0.015**2 for s in errors]))

@@ -184,7 +184,7 @@ def test_corners_off_the_plate_are_warned_of():
     left = made.sighting.uv_px[:, 0] < 330.0
     part = type(made.sighting)(
         made.sighting.uv_px[left], made.sighting.plate_m[left], made.sighting.covariance_px[left],
-        made.sighting.ids[left], made.sighting.size_px, 0.0, "beside.png",
+        made.sighting.size_px, 0.0, "beside.png",
     )  # fmt: skip
     found = solved(Trial(TRUE, part, made.corners))
     warnings = average([found], False).warnings

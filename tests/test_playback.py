@@ -84,15 +84,13 @@ def test_an_image_has_its_own_overlay(run: Run, recording: Recording):
     for seq in (min(run.traces), 40, max(run.traces)):
         picture = recording.picture(seq)
         assert picture is not None
-        assert picture.stamp_ns == run.records[seq].stamp_ns and picture.media_type == "image/jpeg"
+        assert picture.stamp_ns == run.records[seq].stamp_ns
         assert np.abs(picture.image.astype(float) - image(seq)).max() < 8.0
         traced = run.traces[seq]
         assert np.allclose(picture.edges_used, traced.edge_uv_px[traced.edge_used], atol=1e-3)
         assert np.allclose(picture.edges_refused, traced.edge_uv_px[~traced.edge_used], atol=1e-3)
         for got, drawn in zip(picture.predicted_edges, traced.predicted_edges_uv_px, strict=True):
             assert np.allclose(got, drawn, atol=1e-3)
-        seen = np.isfinite(traced.predicted_corners_uv_px).all(axis=1)
-        assert np.allclose(picture.predicted_corners, traced.predicted_corners_uv_px[seen], atol=1e-3)
         assert picture.corners == run.records[seq].corners
 
 

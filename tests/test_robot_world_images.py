@@ -90,7 +90,7 @@ def test_what_the_camera_s_errors_do_to_a_target_s_pose_is_what_other_cameras_gi
     uv_px = make_camera(LENS).project(plate_m @ true[:3, :3].T + true[:3, 3])
     uv_px = uv_px + np.random.default_rng(3).normal(0.0, 0.1, uv_px.shape)
     count = len(plate_m)
-    seen = Sighting(uv_px, plate_m, np.tile(0.01 * np.eye(2), (count, 1, 1)), np.arange(count), (640, 480))
+    seen = Sighting(uv_px, plate_m, np.tile(0.01 * np.eye(2), (count, 1, 1)), (640, 480))
     sigmas = np.array([1.0, 0.5, 0.5])
     names = ("fx_px", "cx_px", "coefficients.0")  # fy follows fx
     given = GivenCamera(LENS, names, np.diag(np.square(sigmas * [1.0, 1.0, 0.01])))

@@ -26,6 +26,7 @@ from gripmon.io.sources import (
     open_source,
     settings_for_path,
 )
+from gripmon.io.sources.files import by_opencv
 from gripmon.model.images import grey_image, natural_key, read_image
 from gripmon.model.records import Frame
 
@@ -349,8 +350,8 @@ class TornCapture:
 def test_video_frames_without_a_stamp_or_picture_are_faults(tmp_path: Path):
     make_video(tmp_path / "a.avi")
     source = VideoSource(VideoSettings(path="a.avi"), tmp_path)
-    source._capture.release()
-    source._capture, source._is_there = TornCapture(), False
+    source._frames.close()
+    source._first, source._frames = None, by_opencv(TornCapture())
     frames = read_all(source)
     assert [f.fault is None for f in frames] == [True, False, False, False]
     assert [f.stamp_ns for f in frames] == [0, 40_000_000, 40_000_000, 40_000_000]

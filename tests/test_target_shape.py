@@ -124,7 +124,7 @@ def test_no_point_is_lost_by_a_turn_whatever_the_step_is(step_m: float, columns:
     v, u = np.divmod(np.arange(columns * rows), columns)
     plate_m = step_m * np.column_stack([u, v, np.zeros(len(u))])
     n = len(plate_m)
-    view = Sighting(np.zeros((n, 2)), plate_m, np.zeros((n, 2, 2)), np.arange(n), (640, 480), turns=turns)
+    view = Sighting(np.zeros((n, 2)), plate_m, np.zeros((n, 2, 2)), (640, 480), turns=turns)
     target = TargetPoints.of([view] * 4)
     assert target is not None and len(target.places_m) == columns * rows
     for number in range(turns):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from gripmon.analyse.change_points import FALSE_ALARMS_PER_HOUR, FEWEST_FOR_MEAN
 from gripmon.analyse.correction import SOURCES, Correction, correct, sample
 from gripmon.analyse.smoothing import BLOCK_S, SLOW_S
 from gripmon.analyse.words import clock_time, count, millimetres
+from gripmon.model.atomic import opened_atomically
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.record.recordings import Recording
@@ -161,26 +161,22 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
 
     ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
     """
-    part, about = path.with_name(f".{path.name}.part"), _about(runs, inputs)
+    about = _about(runs, inputs)
     try:
-        if path.suffix.lower() == ".rrd":
-            from gripmon.record.compared import write_track
+        with opened_atomically(path) as file:
+            if path.suffix.lower() == ".rrd":
+                from gripmon.record.compared import track
 
-            recording = runs[number].recording
-            write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
-        elif path.suffix.lower() == ".parquet":
-            whole = pa.concat_tables([_table(k, each) for k, each in enumerate(runs)])
-            whole = whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)})
-            pq.write_table(whole, part, compression="zstd")
-        else:
-            with part.open("wb") as file:
+                recording = runs[number].recording
+                file.write(track(recording.recording_id, recording.frames, runs[number].correction, about))
+            elif path.suffix.lower() == ".parquet":
+                whole = pa.concat_tables([_table(k, each) for k, each in enumerate(runs)])
+                whole = whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)})
+                pq.write_table(whole, file, compression="zstd")
+            else:
                 file.writelines(msgspec.json.encode(line) + b"\n" for line in (about, *_lines(runs)))
-        part.replace(path)
     except OSError as error:
         raise NoResultError(f"--out {path}: writing failed ({error.strerror or error})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def _lines(runs: Sequence[CorrectedRun]) -> Iterator[dict[str, Any]]:

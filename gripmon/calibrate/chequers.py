@@ -58,13 +58,13 @@ class _Alternating:
         )
 
 
-def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[float, float]]]:
-    """Lattices of corners (column, row) -> (u, v), to about a pixel: the one that fits into ``columns`` x ``rows`` in
+def find_corners(grey: Grey, columns: int, rows: int) -> dict[Index, tuple[float, float]]:
+    """Lattice of corners (column, row) -> (u, v), to about a pixel: the one that fits into ``columns`` x ``rows`` in
     either orientation and has the most total contrast, or otherwise the largest that was found; empty if there is none.
     """
     best: dict[Index, tuple[float, float]] = {}
     shown = 0.0
-    others: list[dict[Index, tuple[float, float]]] = []
+    largest: dict[Index, tuple[float, float]] = {}
     for scale in SCALES:
         candidates = saddles(grey, scale)
         good, second = crossing(grey, candidates, np.full(len(candidates), 2.0 * scale + 2.0))
@@ -81,12 +81,12 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
                 if contrast > shown:
                     best, shown = found, contrast
             elif len(found) >= 9:
-                others.append(found)
+                largest = max(largest, found, key=len)
             left = np.delete(np.arange(len(candidates)), chosen)
             candidates, second = candidates[left], second[left]
         if len(best) == columns * rows:
             break
-    return [best or max(others, key=len)] if best or others else []
+    return best or largest
 
 
 def _wide(grey: Grey, candidates: Array, lattice: dict[Index, int]) -> dict[Index, int]:

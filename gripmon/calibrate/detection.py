@@ -78,16 +78,16 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     window = np.minimum(CORNER_RADIUS, 1.3 * margin) * steps - (1.0 if 1.3 * margin < CORNER_RADIUS else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
-    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"], 1)
+    return _sighting(grey, uv_px, plate[ids], covariance, good, 0.0, name, note, FEWEST["charuco"], 1)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
     found = chequers.find_corners(grey, target.columns, target.rows)
     if not found:
         return NotFound(_blurred(grey) or "no chequerboard in the image; one that is evenly lit and not too small")
-    cells, rough = _arrays(found[0])
+    cells, rough = _arrays(found)
     fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
-    if fewer or not fits(found[0], target.columns, target.rows, least=2):
+    if fewer or not fits(found, target.columns, target.rows, least=2):
         return _wrong_count(cells, target.columns, target.rows, "inner corners", fewer)
     steps = _steps(cells, rough)
     starts, ends = _across_squares(cells, rough)
@@ -104,7 +104,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
     fewest = FEWEST["chequerboard"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, fewest, turns)
+    return _sighting(grey, uv_px, plate, covariance, good, 0.0, name, note, fewest, turns)
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
@@ -113,7 +113,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     if not found:
         none = "no lattice of discs in the image; one that is evenly lit and not too small"
         return NotFound(_staggered(grey, target) or _blurred(grey) or none)
-    cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
+    cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found.items()})
     places = _places(grey, cells, rough, target)
     if isinstance(places, NotFound):
         return places
@@ -126,7 +126,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(steps)):
         return NotFound(_too_coarse(blur_px, steps))
     noise = noise_of(grey)
-    first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
+    first = {(c - min(x for x, _ in found), r - min(y for _, y in found)): d for (c, r), d in found.items()}
     centres = [refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
     good = np.array([centre is not None for centre in centres])
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
@@ -135,7 +135,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     turns = turns_alike(target) if _whole(places, *(last + 1 for last in target.last)) else 0
     radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), len(target.places), blur_px)
     fewest = FEWEST["circles"]
-    return _sighting(grey, uv_px, plate, covariance, _numbers(places), good, radius_m, name, note, fewest, turns)
+    return _sighting(grey, uv_px, plate, covariance, good, radius_m, name, note, fewest, turns)
 
 
 def _places(grey: Grey, cells: NDArray[np.intp], rough: Array, target: CircleGrid) -> NDArray[np.intp] | NotFound:
@@ -161,9 +161,9 @@ def _staggered(grey: Grey, target: CircleGrid) -> str:
     staggered = StaggeredCircles(target.columns, target.rows, target.spacing_m, target.diameter_m)
     (columns, rows), step_m = lattice_of(staggered)
     found = find_discs(grey, columns, rows, step_m / target.diameter_m, len(staggered.places))
-    if not found or len(found[0]) <= _MOST_OF * len(staggered.places):
+    if not found or len(found) <= _MOST_OF * len(staggered.places):
         return ""
-    places = places_of(np.array(list(found[0]), np.intp), staggered)
+    places = places_of(np.array(list(found), np.intp), staggered)
     return "" if places is None else f"the discs are staggered (asymmetric circles); --target {name_of(staggered)}"
 
 
@@ -172,7 +172,6 @@ def _sighting(
     uv_px: Array,
     plate_m: Array,
     covariance: Array,
-    ids: NDArray[np.intp],
     good: NDArray[np.bool_],
     radius_m: float,
     name: str,
@@ -183,7 +182,7 @@ def _sighting(
     if good.sum() < fewest:
         return NotFound(f"{int(good.sum())} points of the target are sharp and free; at least {fewest}")
     size = (grey.shape[1], grey.shape[0])
-    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note, turns)
+    return Sighting(uv_px[good], plate_m[good], covariance[good], size, radius_m, name, note, turns)
 
 
 def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
@@ -203,11 +202,6 @@ def _turned(cells: NDArray[np.intp], columns: int, rows: int) -> NDArray[np.intp
     if seen_columns <= columns and seen_rows <= rows and (seen_columns, seen_rows) != (rows, columns):
         return cells
     out: NDArray[np.intp] = np.stack([cells[:, 1], cells[:, 0].max() - cells[:, 0]], axis=1)
-    return out
-
-
-def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
-    out: NDArray[np.intp] = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
     return out
 
 
@@ -246,17 +240,18 @@ def _sharp(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Sub-pixel corners (n, 2) at lattice coordinates ``cells`` (n, 2), covariances (n, 2, 2), and which are good."""
     noise = noise_of(grey)
-    found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
-    good = _corners(grey, *found, radius_px)
+    first, _, asymmetry = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
+    good = _corners(grey, first, asymmetry, radius_px)
     # The bend of the lattice is known once its corners are.
     bend = np.zeros((len(rough), 3, 2))
     size = (grey.shape[1], grey.shape[0])
-    bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
-    found = chequers.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
-    return found[0], found[1], _corners(grey, *found, radius_px)
+    bend[good] = bends(np.asarray(cells[good], np.float64), first[good], size)
+    starts = np.where(good[:, None], first, rough)
+    uv_px, covariance, asymmetry = chequers.centres_of_symmetry(grey, starts, radius_px, noise, bend)
+    return uv_px, covariance, _corners(grey, uv_px, asymmetry, radius_px)
 
 
-def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
+def _corners(grey: Grey, uv_px: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
     """(n,) which points are corners and not occluded."""
     radius = np.clip(radius_px, chequers.SMALLEST_RADIUS_PX, chequers.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])

@@ -57,28 +57,21 @@ class _Metric:
         return abs(float(a @ b)) < 0.45 * float(np.hypot(*a) * np.hypot(*b))
 
 
-def find_discs(
-    grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int
-) -> list[dict[Index, Disc]]:
-    """Lattices of discs (column, row) -> disc: the largest that fits into ``columns`` x ``rows``, in either
+def find_discs(grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int) -> dict[Index, Disc]:
+    """Lattice of discs (column, row) -> disc: the largest that fits into ``columns`` x ``rows``, in either
     orientation, or otherwise the largest that was found; empty if there is none.  ``count``: when it is complete.
     """
     if max(grey.shape) > LARGE_PX:
         half: Grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         found = _search(half, columns, rows, spacing_per_diameter, count)
-        if found and fits(found[0], columns, rows):
-            return [
-                {cell: Disc(2.0 * d.centre_px + 0.5, 4.0 * d.spread_px2, d.dark) for cell, d in one.items()}
-                for one in found
-            ]
+        if found and fits(found, columns, rows):
+            return {cell: Disc(2.0 * d.centre_px + 0.5, 4.0 * d.spread_px2, d.dark) for cell, d in found.items()}
     return _search(grey, columns, rows, spacing_per_diameter, count)
 
 
-def _search(
-    grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int
-) -> list[dict[Index, Disc]]:
+def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float, count: int) -> dict[Index, Disc]:
     best: dict[Index, Disc] = {}
-    others: list[dict[Index, Disc]] = []
+    largest: dict[Index, Disc] = {}
     shown = to_bytes(grey)
     seen: dict[bool, tuple[Array, Array]] = {dark: (np.zeros((0, 2)), np.zeros((0, 2, 2))) for dark in (True, False)}
     for part in _BLOCKS:
@@ -96,12 +89,12 @@ def _search(
                 if fits(found, columns, rows):
                     best = max(best, found, key=len)
                 elif len(found) >= 9:
-                    others.append(found)
+                    largest = max(largest, found, key=len)
                 left = np.delete(np.arange(len(centres)), chosen)
                 centres, spreads = centres[left], spreads[left]
             if len(best) == count:
-                return [best]
-    return [best or max(others, key=len)] if best or others else []
+                return best
+    return best or largest
 
 
 def _united(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ GATE_STEPS = 0.35
 SEEDS = 60
 """Maximum number of seeds that are tried."""
 _NEIGHBOURS = 8
-_STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_WAYS = ((0, 1), (0, -1), (1, 1), (1, -1))  # axis and direction
 Index = tuple[int, int]
 
 
@@ -88,7 +88,7 @@ def trimmed(lattice: dict[Index, int], columns: int, rows: int) -> dict[Index, i
     return out
 
 
-def extent(lattice: dict[Index, int]) -> tuple[int, int]:
+def extent(lattice: Mapping[Index, object]) -> tuple[int, int]:
     """Columns and rows that a lattice spans."""
     if not lattice:
         return 0, 0
@@ -133,11 +133,10 @@ def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], r
     while queue:
         at = queue.popleft()
         here = points[found[at]]
-        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            to = (at[0] + sign, at[1]) if axis == 0 else (at[0], at[1] + sign)
+        for axis, sign in _WAYS:
+            to, behind = _beside(at, axis, sign), _beside(at, axis, -sign)
             if to in found:
                 continue
-            behind = (at[0] - sign, at[1]) if axis == 0 else (at[0], at[1] - sign)
             step = here - points[found[behind]] if behind in found else sign * local[at][axis]
             index = _near(tree, here + step, float(np.hypot(*step)))
             if index is None or index in taken or not rules.neighbours(found[at], index, points[index] - here):
@@ -154,11 +153,15 @@ def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], r
 
 def _own_steps(points: Array, found: dict[Index, int], at: Index, otherwise: Array) -> Array:
     out = otherwise.copy()
-    for dx, dy in _STEPS:
-        neighbour = (at[0] + dx, at[1] + dy)
+    for axis, sign in _WAYS:
+        neighbour = _beside(at, axis, sign)
         if neighbour in found:
-            out[0 if dx else 1] = (points[found[neighbour]] - points[found[at]]) * (dx + dy)
+            out[axis] = sign * (points[found[neighbour]] - points[found[at]])
     return out
+
+
+def _beside(at: Index, axis: int, steps: int) -> Index:
+    return (at[0] + steps, at[1]) if axis == 0 else (at[0], at[1] + steps)
 
 
 def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
@@ -166,8 +169,7 @@ def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
     out = dict(lattice)
     for at, index in lattice.items():
         for axis in (0, 1):
-            before = (at[0] - 1, at[1]) if axis == 0 else (at[0], at[1] - 1)
-            after = (at[0] + 1, at[1]) if axis == 0 else (at[0], at[1] + 1)
+            before, after = _beside(at, axis, -1), _beside(at, axis, 1)
             if before in lattice and after in lattice:
                 low, high = points[lattice[before]], points[lattice[after]]
                 off = np.hypot(*(points[index] - 0.5 * (low + high)))
@@ -180,8 +182,5 @@ def fits(lattice: Mapping[Index, object], columns: int, rows: int, least: int = 
     """Whether a lattice can be part of ``columns`` x ``rows``, in either orientation, and is large enough: nine points,
     and ``least`` in each of its rows and columns.
     """
-    if len(lattice) < 9:
-        return False
-    cells = np.array(list(lattice))
-    seen = cells.max(axis=0) - cells.min(axis=0) + 1
-    return bool(max(seen) <= max(columns, rows) and least <= min(seen) <= min(columns, rows))
+    seen = extent(lattice)
+    return len(lattice) >= 9 and max(seen) <= max(columns, rows) and least <= min(seen) <= min(columns, rows)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gripmon.calibrate.bundle import independent_errors
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, perturb, perturbation_between, skew
@@ -257,9 +258,7 @@ class FreePose:
 
     def own_slopes(self, cam_T_plate: Array, contact_m: float) -> Array:
         """(3, 6): effect of the pose's own independent errors, per standard deviation, on :func:`off_plate`."""
-        scale = np.sqrt(self.covariance.diagonal())
-        variances, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        roots = (scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))).T
+        roots = independent_errors(self.covariance)
         up, down = (
             np.array([off_plate(perturb(self.cam_T_grip, s * r), cam_T_plate, contact_m) for r in roots])
             for s in (0.5, -0.5)

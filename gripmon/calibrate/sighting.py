@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 
@@ -36,7 +33,6 @@ class Sighting:
     uv_px: Array
     plate_m: Array
     covariance_px: Array
-    ids: NDArray[np.intp]
     size_px: tuple[int, int]
     disc_radius_m: float = 0.0
     name: str = ""

@@ -57,11 +57,10 @@ class Spots:
 
 @dataclass(frozen=True, slots=True)
 class LaserResult:
-    """A laser calibration: the closed form's ``start``, the ``refined`` result, and the ``candidate`` taken for each
-    sample (n,): 0 is the brightest.  ``warnings`` name orientations that contradict the rest.
+    """A laser calibration: the ``refined`` result, and the ``candidate`` taken for each sample (n,): 0 is the
+    brightest.  ``warnings`` name orientations that contradict the rest.
     """
 
-    start: LaserSetup
     refined: Refined
     uv_px: Array
     candidate: NDArray[np.intp]
@@ -170,7 +169,7 @@ def _with_candidates(refiner: _Refiner, spots: Spots, start: LaserSetup) -> Lase
             break
         uv_px, choice = new, new_choice
         found = refiner.refine(uv_px, found.setup)
-    return LaserResult(start, found, uv_px, choice)
+    return LaserResult(found, uv_px, choice)
 
 
 def _check_sizes(found: Refined) -> None:

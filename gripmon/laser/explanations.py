@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.bundle import independent_errors
 from gripmon.laser.documents import Calibrated
 from gripmon.laser.setup import (
     CAMERA,
@@ -139,7 +140,7 @@ class Evidence:
     def of(self, moved: tuple[int, int] | None) -> Fit:
         """The best set-up under an explanation: a kind of motion and its scale, or None for no motion."""
         prior = self._known.covariance if moved is None else self._known.covariance + assumed_motion(*moved)
-        root = _root(prior)
+        root = independent_errors(prior).T
         wide = self._whiten @ self._rows @ root
         # Begin with spots as uncertain as the explanation has them, so that all can take part; then as they are.
         scale = max(math.sqrt(0.5 * float(np.square(wide).sum(axis=(1, 2)).max())), 1.0)
@@ -228,14 +229,6 @@ def covariance_max(a: Array, b: Array) -> Array:
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ a @ inverse.swapaxes(-1, -2))
     out: Array = root @ (axes * np.maximum(values, 1.0)[..., None, :]) @ axes.swapaxes(-1, -2) @ root.swapaxes(-1, -2)
-    return out
-
-
-def _root(covariance: Array) -> Array:
-    """(13, 13) with ``root @ root.T`` the covariance, which may be singular."""
-    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    out: Array = scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0))
     return out
 
 

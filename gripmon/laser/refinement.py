@@ -47,8 +47,8 @@ _LEAST = 1e-9
 class Refined:
     """Result of the refinement: ``covariance`` (13, 13) of :data:`~gripmon.laser.setup.PARAMETERS` at ``setup``;
     ``residuals_px`` (n, 2) measured less predicted; ``used`` (n,); ``scale``: the residuals' standard deviation over
-    the one by the spots' covariances (in pixels if these are unit matrices); ``lens`` (p,): changes of the lens's free
-    parameters, and ``lens_covariance`` (p, p), empty if the lens was held.
+    the one by the spots' covariances (in pixels if these are unit matrices); ``camera``: the refined one if the
+    lens was not held.
     """
 
     setup: LaserSetup
@@ -58,8 +58,6 @@ class Refined:
     scale: float
     degrees_of_freedom: int
     camera: LensSettings
-    lens: Array
-    lens_covariance: Array
 
     @property
     def rms_px(self) -> float:
@@ -195,7 +193,7 @@ def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Re
         ) from None
     return Refined(
         state.setup, covariance[:COUNT, :COUNT], problem.residuals_px(state), used, scale,
-        2 * int(used.sum()) - COUNT, problem.camera(state).settings, state.lens, covariance[COUNT:, COUNT:],
+        2 * int(used.sum()) - COUNT, problem.camera(state).settings,
     )  # fmt: skip
 
 

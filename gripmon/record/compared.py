@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -61,12 +60,11 @@ def _name_both(stream: rr.RecordingStream) -> None:
             send.lines(path, [f"{whose} {name}" for name in names], pale, width)
 
 
-def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: Any) -> None:
-    """Write a run's frame table and its correction into a file; ``about`` is kept as JSON.
+def track(recording_id: str, frames: Any, correction: Any, about: Any) -> bytes:
+    """A run's frame table and its correction as a file's bytes; ``about`` is kept as JSON.
 
     It has the recording id of the original, so that a viewer shows both files as one, on the same timelines.  Shifts of
     the TCP are relative to the first corrected frame, mm, camera axes; raw and smoothed are the live estimates.
-    Raises OSError if the file can't be written.
     """
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
     memory = stream.memory_recording()  # rerun's file sink doesn't report a full disk
@@ -82,8 +80,9 @@ def write_track(path: Path, recording_id: str, frames: Any, correction: Any, abo
     for begin in range(0, len(correction.stamp_ns), _TRACK_ROWS_A_CHUNK):
         _track_columns(send, frames, correction, slice(begin, begin + _TRACK_ROWS_A_CHUNK))
     _track_events(send, frames, correction)
-    path.write_bytes(memory.drain_as_bytes())
+    whole = memory.drain_as_bytes()
     stream.disconnect()
+    return whole
 
 
 def _track_columns(send: Sender, frames: Any, correction: Any, rows: slice) -> None:

@@ -6,8 +6,8 @@ import time
 from typing import TYPE_CHECKING
 
 from gripmon.model.errors import one_line
-from gripmon.record.recorder import LOOPBACK, Scene, ViewSettings
-from gripmon.record.taking import LiveInbox
+from gripmon.record.recorder import LOOPBACK, Row, Scene, ViewSettings
+from gripmon.record.taking import Inbox, Load
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -18,10 +18,11 @@ _FLUSH_TIMEOUT_S = 1.0
 _REPEAT_S = 60.0  # what is sent on change only is sent again, for viewers that join after it was dropped
 _RETRY_S = 10.0
 _WAITING_MEMORY_FRACTION = 0.25  # of the view's memory limit, for the pictures of queued rows
+_ROWS_FOR_VIEWERS = 512
 
 
-class LiveStream(LiveInbox):
-    """Serves rows to viewers.  What can't be served is dropped; ``failure`` says why, None while all is well.
+class LiveStream(Inbox):
+    """Serves rows to viewers: the newest, as many as the limits allow.  What can't be served is dropped.
 
     The server keeps what it has sent up to a limit and drops the oldest data; a stalled viewer blocks it, and rows that
     arrive meanwhile are not shown.  The stream is separate from that of the files, which may begin and end without
@@ -29,7 +30,7 @@ class LiveStream(LiveInbox):
     """
 
     def __init__(self, scene: Scene, settings: ViewSettings) -> None:
-        super().__init__(_WAITING_MEMORY_FRACTION * settings.memory_limit_bytes, scene.reference)
+        super().__init__(scene.reference)
         self._scene, self._settings = scene, settings
         self._stream: rr.RecordingStream | None = None  # the same after a failure: rerun keeps every stream for good
         self._writer: RowWriter | None = None  # None: nothing is served
@@ -61,6 +62,18 @@ class LiveStream(LiveInbox):
         """End the server; while a viewer blocks it, this doesn't return."""
         if self._writer is not None and self._stream is not None:
             self._stream.disconnect()
+
+    def _bound(self, load: Load) -> None:
+        load.rows, load.late = self._newest(load.rows), self._newest(load.late)
+
+    def _newest(self, rows: list[Row]) -> list[Row]:
+        left_bytes, kept = _WAITING_MEMORY_FRACTION * self._settings.memory_limit_bytes, 0
+        for row in reversed(rows[-_ROWS_FOR_VIEWERS:]):
+            left_bytes -= row.picture_bytes
+            if left_bytes < 0:
+                break
+            kept += 1
+        return rows[len(rows) - kept :]
 
     def _flush(self) -> None:
         """Wait until everything is sent; a server that is gone fails at once, a blocked one after a timeout."""

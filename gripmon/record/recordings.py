@@ -36,7 +36,6 @@ _POINTS = "Points2D:positions"
 _DRAWN = {
     entities.EDGES_USED: _POINTS,
     entities.EDGES_REFUSED: _POINTS,
-    entities.PREDICTED_CORNERS: _POINTS,
     entities.PREDICTED_EDGES: entities.STRIPS,
 }
 Pixels = NDArray[np.float32]
@@ -47,18 +46,16 @@ class Picture:
     """An image with what was measured in it; positions in the distorted image, px, first pixel's centre at 0.
 
     ``image`` is (height, width) or (height, width, 3) BGR, uint8 or uint16.  Edge points are (n, 2); ``edges_used``
-    are those that the fit used.  ``predicted_edges``: one polyline (k, 2) per visible edge; ``predicted_corners`` (c,
-    2): the visible corners.  All are empty for a refused frame.
+    are those that the fit used.  ``predicted_edges``: one polyline (k, 2) per visible edge.  All are empty for a
+    refused frame.
     """
 
     seq: int
     stamp_ns: int
     image: Image
-    media_type: str
     edges_used: Pixels
     edges_refused: Pixels
     predicted_edges: tuple[Pixels, ...]
-    predicted_corners: Pixels
     corners: tuple[CornerRecord, ...]
 
 
@@ -167,11 +164,9 @@ class Recording:
             seq=seq,
             stamp_ns=shot.stamp_ns,
             image=image,
-            media_type=shot.media_type,
             edges_used=drawing.points(entities.EDGES_USED),
             edges_refused=drawing.points(entities.EDGES_REFUSED),
             predicted_edges=tuple(np.array(strip, np.float32).reshape(-1, 2) for strip in strips if strip),
-            predicted_corners=drawing.points(entities.PREDICTED_CORNERS),
             corners=() if record is None else record.corners,
         )
 

@@ -29,7 +29,6 @@ _BEAT_PERIOD_S = 0.5  # longest time between two reports to the daemon
 _ROWS_AT_ONCE = 128
 _PICTURE_BYTES_AT_ONCE = 16_000_000
 _MOST_PICTURE_BYTES = 64_000_000  # waiting for the disk
-_ROWS_FOR_VIEWERS = 512
 _SLOW_DISK_POLL_S = 0.01
 _DISK_ANSWERS_WITHIN_S = 2.0
 _STAMPS_KEPT = 4096
@@ -52,7 +51,9 @@ class Load:
 
 
 class Inbox:
-    """Where one thread adds what another writes."""
+    """Where one thread adds what another writes.  ``failure``: why nothing is written, None while all is well."""
+
+    failure: str | None = None
 
     def __init__(self, reference: ReferenceRecord | None = None) -> None:
         """``reference``: the one in force, None: unknown."""
@@ -125,28 +126,6 @@ class Inbox:
         """Drop what is too much."""
 
 
-class LiveInbox(Inbox):
-    """What waits for viewers: the newest rows, as many as the limits allow."""
-
-    failure: str | None = None
-
-    def __init__(self, most_bytes: float, reference: ReferenceRecord | None = None) -> None:
-        super().__init__(reference)
-        self._most_bytes = most_bytes
-
-    def _bound(self, load: Load) -> None:
-        load.rows, load.late = self._newest(load.rows), self._newest(load.late)
-
-    def _newest(self, rows: list[Row]) -> list[Row]:
-        left_bytes, kept = self._most_bytes, 0
-        for row in reversed(rows[-_ROWS_FOR_VIEWERS:]):
-            left_bytes -= row.picture_bytes
-            if left_bytes < 0:
-                break
-            kept += 1
-        return rows[len(rows) - kept :]
-
-
 class FileInbox(Inbox):
     """What waits for the files: rows are bounded by the daemon, which counts what isn't written yet; pictures here.
 
@@ -154,8 +133,6 @@ class FileInbox(Inbox):
     """
 
     path: str | None = None
-    failure: str | None = None
-    """Why nothing is being written, None while all is well."""
     notice: str | None = None
     """Findings about earlier files."""
 
@@ -197,7 +174,7 @@ class Taker:
         batches: Connection,
         reports: Connection,
         files: FileInbox,
-        live: LiveInbox | None,
+        live: Inbox | None,
     ) -> None:
         self._settings, self._images, self._batches, self._reports = settings, images, batches, reports
         self._files, self._live = files, live

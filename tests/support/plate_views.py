@@ -96,7 +96,7 @@ def trial(
     sigma_px = max(noise_px, 0.01)
     covariance = np.tile(np.eye(2) * sigma_px**2, (len(uv_px), 1, 1))
     size = (lens.width_px, lens.height_px)
-    sighting = Sighting(uv_px, plate_m[inside], covariance, np.flatnonzero(inside), size, 0.0, name)
+    sighting = Sighting(uv_px, plate_m[inside], covariance, size, 0.0, name)
     corner_uv = seen_by(moved(cam_T_grip, corners_m), lens) + rng.normal(0.0, corner_px, (len(corners_m), 2))
     each = np.tile(np.eye(2) * max(corner_px, 0.01) ** 2, (len(corners_m), 1, 1))
     return Trial(cam_T_grip, sighting, FingerCorners.independent(NAMES[: len(corners_m)], corner_uv, each))

@@ -71,9 +71,7 @@ def seen(
         uv[wrong] += rng.uniform(-30.0, 30.0, (wrong.sum(), 2))
         covariance = np.tile(noise_px**2 * np.eye(2), (len(uv), 1, 1))
         name = f"view {k}"
-        out.append(
-            Sighting(uv, PLATE_M[ok], covariance, np.flatnonzero(ok), size, radius_m, name, turns=turns)
-        )
+        out.append(Sighting(uv, PLATE_M[ok], covariance, size, radius_m, name, turns=turns))
     return out
 
 
@@ -81,6 +79,5 @@ def part_of(view: Sighting, width_m: float, height_m: float) -> Sighting:
     """The view's points up to there along x and y."""
     kept = (view.plate_m[:, 0] < width_m + 1e-6) & (view.plate_m[:, 1] < height_m + 1e-6)
     return replace(
-        view, uv_px=view.uv_px[kept], plate_m=view.plate_m[kept], covariance_px=view.covariance_px[kept],
-        ids=view.ids[kept],
-    )  # fmt: skip
+        view, uv_px=view.uv_px[kept], plate_m=view.plate_m[kept], covariance_px=view.covariance_px[kept]
+    )

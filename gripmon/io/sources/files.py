@@ -8,10 +8,10 @@ import itertools
 import logging
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
@@ -222,8 +222,8 @@ class VideoSource(Stored):
         self._path = relative_to / settings.path
         if not self._path.is_file():
             raise SourceError(f"path: there is no file {self._path}; a video file")
-        self._capture, self._due_s = _opened_video(self._path)
-        self._is_there = True  # the next frame was grabbed
+        self._first: _Timed | None
+        self._first, self._frames, self._due_s = _opened_video(self._path)
         self._fps = settings.fps
         self._seq = 0
         self._last_ns = self._last_stamp_ns = -1
@@ -242,18 +242,19 @@ class VideoSource(Stored):
     def _next_frame(self) -> Frame | None:
         if not self._open:
             return None
-        if not (self._is_there or self._capture.grab()):
+        found, self._first = self._first, None
+        try:
+            at_ns, image = found or next(self._frames)
+        except (StopIteration, SourceError) as end:
             end_s = 1e-9 * self._last_ns
-            if fault := getattr(self._capture, "fault", ""):  # OpenCV names none
-                _log.warning("the video ends after %.3g s: %s", end_s, fault)
+            if isinstance(end, SourceError):  # OpenCV says none
+                _log.warning("the video ends after %.3g s: %s", end_s, end)
             elif self._due_s > end_s + 1e-9 * self._longest_ns:
                 _log.warning("%s ends after %.3g s of %.3g s; is it truncated?", self._path, end_s, self._due_s)
             self._end()
             return None
-        self._is_there = False
-        stamp_ns, fault = self._stamp()
-        decoded, image = self._capture.retrieve()
-        if not decoded:
+        stamp_ns, fault = self._stamp(at_ns)
+        if image is None:
             fault = "the video frame can't be decoded"
         frame = Frame(self._seq, stamp_ns, image if fault is None else None, None, self._path.name, fault)
         self._seq += 1
@@ -262,11 +263,9 @@ class VideoSource(Stored):
 
     def _end(self) -> None:
         self._open = False
-        self._capture.release()
+        self._frames.close()
 
-    def _stamp(self) -> tuple[int, str | None]:
-        stamp_ms = self._capture.get(_CAP_PROP_POS_MSEC)
-        at_ns = round(stamp_ms * 1e6) if math.isfinite(stamp_ms) else -1
+    def _stamp(self, at_ns: int) -> tuple[int, str | None]:
         if self._seq:
             self._longest_ns = max(self._longest_ns, at_ns - self._last_ns)
         self._last_ns = max(at_ns, self._last_ns)
@@ -277,20 +276,12 @@ class VideoSource(Stored):
         return at_ns, None
 
 
-_CAP_PROP_POS_MSEC = 0  # OpenCV's
+_Timed = tuple[int, Any]
+"""When a frame is, by its container (ns; -1: it doesn't say), and its image, H x W x 3 (BGR); None: there is none."""
 
 
-class _Capture(Protocol):
-    """An open video, as OpenCV's."""
-
-    def grab(self) -> bool: ...
-    def retrieve(self) -> tuple[bool, Any]: ...
-    def get(self, property_number: int) -> float: ...
-    def release(self) -> None: ...
-
-
-def _opened_video(path: Path) -> tuple[_Capture, float]:
-    """A video whose first frame was grabbed, and when, by its header, its last frame but one is due (s); 0: unknown.
+def _opened_video(path: Path) -> tuple[_Timed, Generator[_Timed], float]:
+    """A video's first frame, the others, and when, by its header, its last frame but one is due (s); 0: unknown.
 
     The number of frames is an estimate in some containers, by the length and the mean rate.
     """
@@ -303,49 +294,40 @@ def _opened_video(path: Path) -> tuple[_Capture, float]:
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     fps = capture.get(cv2.CAP_PROP_FPS)
     due_s = (capture.get(cv2.CAP_PROP_FRAME_COUNT) - 2.0) / fps if fps > 0.0 else 0.0
-    if capture.grab():
-        return capture, due_s
     codec = round(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1")
-    capture.release()
+    frames, why = by_opencv(capture), repr(codec)
+    if (first := next(frames, None)) is not None:
+        return first, frames, due_s
     try:
-        other = _ByPyAv(path)
+        needed("av")
     except SourceError as error:
         raise SourceError(f"path: {path}: OpenCV can't decode this {codec!r}, PyAV may ({error})") from None
-    if other.grab():
-        return other, due_s
-    why = other.fault or repr(codec)
+    frames = _by_pyav(path)
+    try:
+        if (first := next(frames, None)) is not None:
+            return first, frames, due_s
+    except SourceError as error:
+        why = str(error)
     raise SourceError(f"path: {path} has no frame that can be decoded ({why}); a complete video")
 
 
-class _ByPyAv:
-    """A video by PyAV; its frames are as it has them, whatever it says of the way up.  ``fault``: why it ended before
-    the end, empty if it didn't.
-    """
+def by_opencv(capture: Any) -> Generator[_Timed]:
+    """The frames of an open ``cv2.VideoCapture``, which is released in the end."""
+    try:
+        while capture.grab():
+            at_ms = capture.get(_CAP_PROP_POS_MSEC)
+            decoded, image = capture.retrieve()
+            yield round(1e6 * at_ms) if math.isfinite(at_ms) else -1, image if decoded else None
+    finally:
+        capture.release()
 
-    fault = ""
 
-    def __init__(self, path: Path) -> None:
-        needed("av")
-        self._frames = video_frames(str(path), 0.0)
-        self._first_s = math.nan
-        self._frame: tuple[float, Any] | None = None
+_CAP_PROP_POS_MSEC = 0  # OpenCV's
 
-    def grab(self) -> bool:
-        try:
-            self._frame = next(self._frames, None)
-        except SourceError as error:
-            self._frame, self.fault = None, str(error)
-        if self._frame is not None and math.isnan(self._first_s):
-            self._first_s = self._frame[0]
-        return self._frame is not None
 
-    def retrieve(self) -> tuple[bool, Any]:
-        assert self._frame is not None
-        return True, self._frame[1].to_ndarray(format="bgr24")
-
-    def get(self, property_number: int) -> float:
-        assert property_number == _CAP_PROP_POS_MSEC and self._frame is not None
-        return 1e3 * (self._frame[0] - self._first_s)
-
-    def release(self) -> None:
-        self._frames.close()
+def _by_pyav(path: Path) -> Generator[_Timed]:
+    """As PyAV has them, whatever it says of the way up.  Raises :class:`SourceError` where the file is damaged."""
+    first_s: float | None = None
+    for at_s, frame in video_frames(str(path), 0.0):
+        first_s = at_s if first_s is None else first_s
+        yield round(1e9 * (at_s - first_s)), frame.to_ndarray(format="bgr24")
