@@ -109,10 +109,9 @@ class UnknownGripper:
         if rough is None:
             raise InputError("an unknown gripper needs rough corners")
         outline, camera = outlines_of(rough), make_camera(self.camera.lens)
-        corners, snapped = measure_outlines(camera, image, outline)
-        return ImageOnPlate(
-            calibrate_image(self.camera, sighting, corners, None), {}, replace(outline, points=snapped.points)
-        )
+        corners, points = measure_outlines(camera, image, outline)
+        found = calibrate_image(self.camera, sighting, corners, None)
+        return ImageOnPlate(found, {}, replace(outline, points=points))
 
 
 @dataclass(frozen=True, slots=True)
