@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from gripmon.analyse.content import Event
 from gripmon.analyse.events import MOTIONS
-from gripmon.analyse.overlay import Colour, Line, Marks, jpeg
 from gripmon.analyse.track import Track
+from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.records import AlertKind, Origin, Verdict
 from gripmon.record.recorder import to_8_bit
 from gripmon.record.recordings import Picture, Recording
@@ -24,6 +24,7 @@ _SEEN = (
 """Kinds of events for which pictures may be instructive."""
 _OVERLAY_FRAMES = 6
 _WIDTH_PX, _JPEG_QUALITY = 560, 82  # of a picture on the page
+_DOT_PX, _RING_PX = 2.0, 5.0
 _MARGIN = 0.18  # of the gripper's size, around it
 _SMALLEST = 0.35  # of the image's width: a smaller part doesn't show the scene
 _PREDICTED: Colour = (255, 200, 60)
@@ -105,7 +106,7 @@ def cut_alike(pictures: Sequence[Picture | None], used: Sequence[bool]) -> tuple
     """
     first = pictures[0]
     box = _box([picture for picture in pictures if picture is not None])
-    outline = () if first is None else tuple(Line(strip, _BEFORE, 2) for strip in first.predicted_edges)
+    outline = () if first is None else first.predicted_edges
     return tuple(
         None if picture is None else _drawn(picture, is_used, box, () if picture is first else outline)
         for picture, is_used in zip(pictures, used, strict=True)
@@ -137,15 +138,21 @@ def _box(pictures: Sequence[Picture]) -> tuple[int, int, int, int]:
 
 
 def _drawn(
-    picture: Picture, used: bool, box: tuple[int, int, int, int], outline: Sequence[Line]
+    picture: Picture, used: bool, box: tuple[int, int, int, int], outline: Sequence[Points]
 ) -> ShownPicture | None:
     left, top, right, bottom = box
     image = to_8_bit(picture.image)
     if not image[top:bottom, left:right].size:
         return None
-    lines = [*outline, *(Line(strip, _PREDICTED) for strip in picture.predicted_edges)]
-    marks = [Marks(picture.edges_used, _USED if used else _REFUSED), Marks(picture.edges_refused, _REFUSED)]
-    marks += [Marks(_corners(picture), _CORNER, rings=True)] if used else []
-    text = base64.b64encode(jpeg(image, lines, marks, _WIDTH_PX, _JPEG_QUALITY, box)).decode("ascii")
+    canvas = Canvas(image[top:bottom, left:right], _WIDTH_PX / (right - left), (left, top), colours=True)
+    for strip in outline:
+        canvas.line(strip, _BEFORE, 2)
+    for strip in picture.predicted_edges:
+        canvas.line(strip, _PREDICTED)
+    canvas.circle(picture.edges_used, _DOT_PX, _USED if used else _REFUSED, -1)
+    canvas.circle(picture.edges_refused, _DOT_PX, _REFUSED, -1)
+    if used:
+        canvas.circle(_corners(picture), _RING_PX, _CORNER, 2)
+    text = base64.b64encode(canvas.jpeg(_JPEG_QUALITY)).decode("ascii")
     height_px = max(round(_WIDTH_PX / (right - left) * (bottom - top)), 1)
     return ShownPicture(picture.seq, picture.stamp_ns, f"data:image/jpeg;base64,{text}", _WIDTH_PX, height_px)

@@ -23,7 +23,7 @@ import numpy as np
 from gripmon.calibrate.bundle import independent_errors
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import invert, perturb, perturbation_between, skew
+from gripmon.model.geometry import invert, perturb, perturbation_between, seen_from
 from gripmon.model.least_squares import fit, whitening
 from gripmon.model.records import Array
 
@@ -273,13 +273,8 @@ def pose_of_points(start: Array, points_m: Array, xy: Array, whiten: Array | Non
     """
 
     def linearised(pose: Array) -> tuple[Array, Array]:
-        turned = points_m @ pose[:3, :3].T
-        x, y, z = (turned + pose[:3, 3]).T
-        by_point = np.zeros((len(z), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
-        by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
-        rows = np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
-        values = xy - np.stack([x / z, y / z], axis=1)
+        seen, rows = seen_from(pose, points_m)
+        values = xy - seen
         return (rows, values) if whiten is None else (whiten @ rows, np.einsum("nij,nj->ni", whiten, values))
 
     return fit(start, linearised, perturb).state

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
-
-from gripmon.analyse.overlay import Colour, Line, Marks, jpeg
 from gripmon.io.sources.payload import PayloadError, snapshot_image
 from gripmon.model.camera import Camera
+from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, Image, Outlines, Snapshot
 from gripmon.record.recorder import to_8_bit
@@ -17,6 +15,7 @@ _OUTLINE: dict[str, Colour] = {"valid": (120, 220, 60), "suspect": (60, 190, 255
 _LOST: Colour = (80, 80, 255)
 _REFERENCE: Colour = (255, 255, 255)
 _CORNER, _REFUSED = (40, 220, 250), (80, 80, 255)
+_RING_PX = 5.0
 _QUALITY = 85  # of JPEG, percent
 
 
@@ -50,10 +49,13 @@ def overlay(
     """JPEG ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners, yellow
     if they were used, red if not; ``reference_px``: instead of these, white, where the edges are to be.
     """
-    lines = [Line(line_px, _OUTLINE.get(record.verdict.value, _LOST), 2) for line_px in outlines]
-    lines += [Line(line_px, _REFERENCE) for line_px in reference_px or ()]
-    corners = [c for c in record.corners if c.uv_px is not None] if reference_px is None else []
-    rings = [Marks(corner.uv_px, _CORNER if corner.used else _REFUSED, rings=True) for corner in corners]
     shown = to_8_bit(image)
-    grey: Image = cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY) if shown.ndim == 3 else shown
-    return jpeg(grey, lines, rings, width_px, _QUALITY)
+    canvas = Canvas(shown, width_px / shown.shape[1])
+    for line_px in outlines:
+        canvas.line(line_px, _OUTLINE.get(record.verdict.value, _LOST), 2)
+    for line_px in reference_px or ():
+        canvas.line(line_px, _REFERENCE)
+    for corner in record.corners if reference_px is None else ():
+        if corner.uv_px is not None:
+            canvas.circle(corner.uv_px, _RING_PX, _CORNER if corner.used else _REFUSED, 2)
+    return canvas.jpeg(_QUALITY)

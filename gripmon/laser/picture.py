@@ -6,44 +6,42 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.laser.calibrating import LaserResult
 from gripmon.laser.setup import beams, spots_on_plane, spots_on_rays
+from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.records import Array, Image
 
 _WIDTH, _HEIGHT, _MARGIN = 800, 640, 50
 _INK, _FAINT, _GOOD, _WRONG = (40, 40, 40), (205, 205, 205), (170, 110, 20), (40, 40, 220)
 _PLANE, _BEAM, _AXES = (120, 180, 90), (90, 90, 235), ((40, 40, 220), (60, 160, 60), (220, 90, 40))
 _FROM_A_CORNER = np.array([[-0.64, 0.77, 0.0], [0.35, 0.29, -0.89]])
-_SUBPIXEL_BITS = 4
-Colour = tuple[int, int, int]
 
 
 class _Panel:
     """A white panel; points are placed in the square that ``corners`` (n, 2) span."""
 
     def __init__(self, title: str, corners: Array):
-        self.image = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+        self._canvas = Canvas(np.full((_HEIGHT, _WIDTH), 255, np.uint8), 1.0)
+        self.image = self._canvas.picture
         self._low = corners.min(axis=0)
         size = np.maximum(corners.max(axis=0) - self._low, 1e-9)
         self.scale = float(((np.array([_WIDTH, _HEIGHT]) - 2 * _MARGIN - 20) / size).min())
         self._put(title, (_MARGIN, 30))
 
-    def _at(self, points: Array) -> NDArray[np.int32]:
-        place = (points - self._low) * self.scale + [_MARGIN, _MARGIN + 10]
-        return np.rint(place * 2**_SUBPIXEL_BITS).astype(np.int32)
+    def _at(self, points: Array) -> Array:
+        return (points - self._low) * self.scale + [_MARGIN, _MARGIN + 10]
 
     def lines(self, points: Sequence[Array], colour: Colour, *, closed: bool = False) -> None:
         """A line each through points (k, 2)."""
-        cv2.polylines(self.image, [self._at(p) for p in points], closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        for line in points:
+            self._canvas.line(self._at(np.concatenate([line, line[:1]]) if closed else line), colour)
 
     def discs(self, points: Array, colour: Colour) -> None:
-        for x, y in self._at(points).tolist():
-            cv2.circle(self.image, (x, y), 3 << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        self._canvas.circle(self._at(points), 3.0, colour, -1)
 
     def text(self, text: str, point: Array) -> None:
-        x, y = (self._at(point) >> _SUBPIXEL_BITS).tolist()
+        x, y = self._canvas.pixel(self._at(point))
         self._put(text, (x + 6, y - 6))
 
     def _put(self, text: str, at: tuple[int, int]) -> None:

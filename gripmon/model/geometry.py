@@ -57,6 +57,17 @@ def left_jacobians(omega: Array) -> Array:
     return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
+def seen_from(cam_T_b: Array, points_b: Array) -> tuple[Array, Array]:
+    """Ideal coordinates (n, 2) of points (n, 3), and their derivatives (n, 2, 6) by a perturbation of the pose."""
+    turned = points_b @ cam_T_b[:3, :3].T
+    points = turned + cam_T_b[:3, 3]
+    xy = points[:, :2] / points[:, 2:]
+    by_point = np.zeros((len(points), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / points[:, 2]
+    by_point[:, :, 2] = -xy / points[:, 2:]
+    return xy, np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
+
+
 def log_rotation(rotation: Array) -> Array:
     """Rotation matrix (3, 3) -> rotation vector (3,), angle in [0, pi]."""
     x, y, z, w = quaternion_xyzw(rotation)

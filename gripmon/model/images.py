@@ -64,9 +64,12 @@ def image_paths(names: Sequence[str | Path]) -> list[Path]:
     return paths
 
 
-def images_of_one_camera(images: Sequence[str | Path | NamedImage | Image]) -> Iterator[tuple[str, Image]]:
-    """Yield each image with its name ("image 1", ... for arrays without one); all must have one size.
-    :class:`~gripmon.model.errors.InputError` for one that can't be read, has another size, or equals an earlier one.
+def images_of_one_camera(
+    images: Sequence[str | Path | NamedImage | Image], size_px: tuple[int, int] | None = None
+) -> Iterator[tuple[str, Image]]:
+    """Yield each image with its name ("image 1", ... for arrays without one); all must have one size, that of the
+    camera if it is given.  :class:`~gripmon.model.errors.InputError` for one that can't be read, has another size, or
+    equals an earlier one.
     """
     seen: dict[bytes, str] = {}
     first_shape: tuple[str, tuple[int, ...]] | None = None
@@ -88,6 +91,8 @@ def images_of_one_camera(images: Sequence[str | Path | NamedImage | Image]) -> I
                 f"{name}: has {width} x {height} px and {first_name} {size[0]} x {size[1]} px; images of one camera, "
                 "in one size"
             )
+        if size_px is not None:
+            check_size(name, image, *size_px)
         yield name, image
 
 

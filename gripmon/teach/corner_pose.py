@@ -15,12 +15,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.bundle import GivenCamera
-from gripmon.calibrate.lens_models import LensModel, lens_vector, model_of, parameter_names
+from gripmon.calibrate.bundle import GivenCamera, independent_errors
+from gripmon.calibrate.lens_models import lens_vector
 from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
+from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, seen_from
 from gripmon.model.gripper import Gripper
+from gripmon.model.least_squares import Equations, minimise, normal_equations
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.inset import inset_corners_px, inset_motion, unstated_inset_m
 from gripmon.track.edges import Measurement
@@ -178,15 +179,9 @@ def _error_sources(
         low_m, high_m = (float(np.clip(opening_m + s, gripper.jaw_min_m, gripper.jaw_max_m)) for s in (-step_m, step_m))
         sources.append(((camera, low_m), (camera, high_m)))
     if error is not None and error.covariance is not None and error.parameters:
-        lens = camera.settings
-        model = LensModel(model_of(lens), lens.width_px, lens.height_px)
-        vector = lens_vector(lens)
-        places = [parameter_names(model.name).index(name) for name in error.parameters]
-        for root in np.linalg.cholesky(error.covariance).T:
-            step = np.zeros(len(vector))
-            step[places] = _STEP * root
-            if "fx_px" in error.parameters and "fy_px" not in error.parameters:
-                step[1] = step[0] * vector[1] / vector[0]
+        vector, model = lens_vector(error.lens), error.model
+        for root in independent_errors(error.covariance):
+            step = _STEP * error.free @ root
             sources.append(((model.camera(vector - step), opening_m), (model.camera(vector + step), opening_m)))
     return sources
 
@@ -306,49 +301,27 @@ def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator
 
 
 def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
-    """Levenberg-Marquardt on the weighted image error and the prior; None where it starts behind the camera.
-
-    Its damping decreases more slowly than in :func:`gripmon.model.least_squares.minimise`: longer steps would take
-    corners set anywhere to poses next to the camera's plane, where nothing is determined.
+    """The pose (4, 4) near a start with the least weighted image error and distance from the prior, its covariance
+    (6, 6), and that cost; None where it starts behind the camera.
     """
     information = np.linalg.inv(prior.covariance)
-    pose, damping = start, 1e-3
-    normal, side, current = _linearised(pose, points_m, xy, weight, prior, information)
-    if not math.isfinite(current):
+
+    def cost(pose: Array) -> float:
+        if not pose[2, 3] > 0.0 or (points_m @ pose[2, :3] + pose[2, 3] <= 0.0).any():
+            return math.inf
+        off, away = xy - seen_from(pose, points_m)[0], perturbation_between(prior.cam_T_grip, pose)
+        return float(weight * np.square(off).sum() + away @ information @ away)
+
+    def equations(pose: Array) -> Equations:
+        shown, slopes = seen_from(pose, points_m)
+        normal, side = normal_equations(slopes, xy - shown)
+        away = perturbation_between(prior.cam_T_grip, pose)
+        return weight * normal + information, weight * side - information @ away
+
+    if not math.isfinite(cost(start)):
         return None
-    for _ in range(_ROUNDS):
-        tried = perturb(pose, np.linalg.solve(normal + damping * np.diag(normal.diagonal()), side))
-        there = _linearised(tried, points_m, xy, weight, prior, information)
-        if there[2] < current:
-            settled = current - there[2] < 1e-6 * (1.0 + there[2])
-            pose, (normal, side, current), damping = tried, there, 0.2 * damping
-            if settled:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e8:
-                break
-    return pose, np.linalg.inv(normal), current
-
-
-def _linearised(
-    pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array
-) -> tuple[Array, Array, float]:
-    """Normal matrix (6, 6), right-hand side (6,) and cost at a pose; infinite behind the camera."""
-    levers = points_m @ pose[:3, :3].T
-    seen = levers + pose[:3, 3]
-    if not pose[2, 3] > 0.0 or (seen[:, 2] <= 0.0).any():
-        return information, np.zeros(6), math.inf
-    away = perturbation_between(prior.cam_T_grip, pose)
-    shown = seen[:, :2] / seen[:, 2:]
-    slopes = np.zeros((len(seen), 2, 3))
-    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / seen[:, 2]
-    slopes[:, :, 2] = -shown / seen[:, 2:]
-    jacobian = np.concatenate([slopes, -slopes @ skew(levers)], axis=2).reshape(-1, 6)
-    residual = (xy - shown).ravel()
-    normal = information + weight * jacobian.T @ jacobian
-    side = weight * jacobian.T @ residual - information @ away
-    return normal, side, float(weight * residual @ residual + away @ information @ away)
+    found = minimise(start, cost, equations, perturb, iterations=_ROUNDS, tolerance=1e-6, damping=1e-3)
+    return found.state, np.linalg.inv(equations(found.state)[0]), found.cost
 
 
 def _same(one: Array, other: Array) -> bool:

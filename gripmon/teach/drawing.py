@@ -12,64 +12,14 @@ from numpy.typing import NDArray
 
 from gripmon.calibrate.plane import Coincidence
 from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.teach.views import TeachingImage
-from gripmon.track.edges.profiles import full_scale
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 
-Colour = tuple[int, int, int]
-"""Blue, green, red."""
-
-_LARGEST_ZOOM, _LEAST_BESIDE_PX = 8, 20.0
-
-_SHIFT = 4  # fractional bits of a pixel in OpenCV's drawing functions
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-
-
-class Canvas:
-    """An image, or the part of it from ``origin_px`` on, enlarged by ``zoom``: ``picture`` (h, w, 3), BGR of 8 bits."""
-
-    def __init__(self, image: Image, zoom: int, origin_px: tuple[int, int] = (0, 0)) -> None:
-        self._origin_px = np.array(origin_px)
-        scaled = image.astype(np.float32) * (255.0 / full_scale(image))
-        grey = cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.ndim == 3 else scaled
-        large = cv2.resize(np.clip(grey, 0.0, 255.0).astype(np.uint8), None, fx=zoom, fy=zoom)
-        self.picture: Image = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
-        self.zoom = zoom
-
-    @classmethod
-    def about(cls, image: Image, points_px: Array, width_px: int) -> Canvas:
-        """The part of an image around points (n, 2), with as much beside them as they take, some ``width_px`` wide: of
-        fingers of 30 px nothing can be seen in a whole image.
-        """
-        height, width = image.shape[:2]
-        low, high = points_px.min(axis=0), points_px.max(axis=0)
-        beside = max(float((high - low).max()) / 2.0, _LEAST_BESIDE_PX)
-        left, top = np.maximum(np.floor(low - beside), 0.0).astype(int).tolist()
-        right, bottom = np.minimum(np.ceil(high + beside) + 1.0, (width, height)).astype(int).tolist()
-        zoom = int(np.clip(-(-width_px // max(right - left, 1)), 1, _LARGEST_ZOOM))
-        return cls(image[top:bottom, left:right], zoom, (left, top))
-
-    def circle(self, at_px: Array, radius_px: float, colour: Colour) -> None:
-        """Draw a circle; ``radius_px`` in the picture's own pixels."""
-        (centre,) = self._fixed(at_px).tolist()
-        cv2.circle(self.picture, centre, round(radius_px * (1 << _SHIFT)), colour, 1, cv2.LINE_AA, _SHIFT)
-
-    def line(self, points_px: Array, colour: Colour, thickness: int = 1) -> None:
-        """Draw a line through points (n, 2)."""
-        cv2.polylines(self.picture, [self._fixed(points_px)], False, colour, thickness, cv2.LINE_AA, _SHIFT)
-
-    def pixel(self, at_px: Array) -> tuple[int, int]:
-        """The position in the picture's own pixels."""
-        u, v = np.rint((np.asarray(at_px) - self._origin_px + 0.5) * self.zoom - 0.5).astype(int).tolist()
-        return u, v
-
-    def _fixed(self, points_px: Array) -> Array:
-        """Points (n, 2) in OpenCV's fixed-point coordinates of the picture."""
-        own = (np.reshape(points_px, (-1, 2)) - self._origin_px + 0.5) * self.zoom - 0.5
-        return np.rint(own * (1 << _SHIFT)).astype(np.int32)
 
 
 def write(picture: Image, text: str, at: tuple[int, int], colour: Colour, size: float) -> None:
@@ -152,8 +102,7 @@ def draw_doubted(
     around = drawn[inside] if inside.any() else np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     canvas = Canvas.about(image.image, around, _SMALLEST_PX)
     for edge, uv_px in zip(edges.tolist(), lines, strict=True):
-        if len(uv_px) > 1:
-            canvas.line(uv_px, _DOUBTED_BGR if doubted[edge] else _SHARP_BGR, 3 if doubted[edge] else 1)
+        canvas.line(uv_px, _DOUBTED_BGR if doubted[edge] else _SHARP_BGR, 3 if doubted[edge] else 1)
     Labels(canvas.picture).title("gripper at the reference (blue); what costs most (red)", why)
     return canvas.picture
 
@@ -259,9 +208,8 @@ _RESIDUALS_TO_PX = 25.0
 _USED: Colour = (120, 220, 90)
 _UNUSED: Colour = (70, 70, 250)
 _MEASURED_BGR: Colour = (40, 220, 250)
+_CAPTION_PX, _CAPTION_GREY = 36, 24
 _AXES: tuple[tuple[str, Colour], ...] = (("x", (80, 80, 255)), ("y", (80, 230, 80)))
-_STRIP = 24
-_SIZE = 0.8
 
 
 def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image:
@@ -269,8 +217,7 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
     (yellow), and lines from where the calibration predicts each of them towards where it was measured, enlarged by the
     factor in the caption; the gripper's axes at the TCP.
     """
-    zoom = int(np.clip(round(_WIDTH_PX / lens.width_px), 1, 4))
-    canvas = Canvas(image, zoom)
+    canvas = Canvas(image, int(np.clip(round(_WIDTH_PX / lens.width_px), 1, 4)))
     residuals, used = found.plate.residuals_px[0], found.plate.used[0]
     sizes = np.linalg.norm(residuals[used], axis=1)
     largest_px = max(float(np.quantile(sizes, 0.95)), float(np.linalg.norm(found.residuals_px, axis=1).max()), 1e-6)
@@ -280,40 +227,23 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
         canvas.circle(uv_px, 3.0, colour)
         if good:
             canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), colour)
-    _axes(canvas, lens, found)
+    labels = Labels(canvas.picture)
+    # The axes, a third of the corners' extent long.
+    reach_m = 0.33 * float(np.abs(found.corners_m[:, :2]).max())
+    ends_m = np.vstack([np.zeros(3), reach_m * np.eye(3)[:2]])
+    axes_px = make_camera(lens).project(ends_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3])
+    if np.isfinite(axes_px).all():
+        for k, (name, colour) in enumerate(_AXES, start=1):
+            canvas.line(axes_px[[0, k]], colour, thickness=2)
+            labels.put(name, canvas.pixel(axes_px[k]), colour)
     for name, uv_px, residual in zip(found.corners.names, found.corners.uv_px, found.residuals_px, strict=True):
         canvas.circle(uv_px, 5.0, _MEASURED_BGR)
         canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), _MEASURED_BGR)
-        # Place the name away from the centre, where the plate's points are: the fingers are darker and uniform.
-        width, height = text_size(name, _SIZE)
-        u, v = canvas.pixel(uv_px)
-        aside = -width - 12 if uv_px[0] < 0.5 * lens.width_px else 12
-        write(canvas.picture, name, (u + aside, v + round(1.6 * height)), _MEASURED_BGR, _SIZE)
-    left_out = int(np.count_nonzero(~used))
-    legend = (
-        f"{int(used.sum())} points of the plate (green), {left_out} left out (red), "
+        labels.put(name, canvas.pixel(uv_px), _MEASURED_BGR)
+    caption = (
+        f"{int(used.sum())} points of the plate (green), {int(np.count_nonzero(~used))} left out (red), "
         f"{len(found.corners.names)} corners (yellow); residuals x {enlarged}"
     )
-    return _with_caption(canvas.picture, legend)
-
-
-def _axes(canvas: Canvas, lens: LensSettings, found: Coincidence) -> None:
-    """Draw the x and y axes, a third of the corners' extent long."""
-    reach_m = 0.33 * float(np.abs(found.corners_m[:, :2]).max())
-    ends_m = np.vstack([np.zeros(3), reach_m * np.eye(3)[:2]])
-    uv_px = make_camera(lens).project(ends_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3])
-    if not np.isfinite(uv_px).all():
-        return
-    for k, (name, colour) in enumerate(_AXES, start=1):
-        canvas.line(uv_px[[0, k]], colour, thickness=2)
-        write(canvas.picture, name, canvas.pixel(uv_px[k]), colour, _SIZE)
-
-
-def _with_caption(picture: Image, text: str) -> Image:
-    """Add the text below, on a strip of its own, as large as the width allows."""
-    width, height = text_size(text, 1.0)
-    size = min(1.2 * _SIZE, 0.96 * picture.shape[1] / width)
-    strip = np.full((round(2.4 * size * height) + 8, picture.shape[1], 3), _STRIP, np.uint8)
-    place = (round(0.01 * picture.shape[1]), round(0.5 * (len(strip) + size * height)))
-    write(strip, text, place, _TEXT_BGR, size)
-    return np.vstack([picture, strip])
+    strip = np.full((_CAPTION_PX, canvas.picture.shape[1], 3), _CAPTION_GREY, np.uint8)
+    Labels(strip).title(caption)
+    return np.vstack([canvas.picture, strip])

@@ -20,7 +20,7 @@ from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.geometry import make_transform
 from gripmon.model.gripper import Gripper, GripperError
-from gripmon.model.images import NamedImage, check_size, images_of_one_camera
+from gripmon.model.images import NamedImage, images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
@@ -104,9 +104,7 @@ def gripper_from_images(
     _check(distance_m, finger_width_m, reference, openings_m, len(images))
     _check_range(jaw_range_m, openings_m)
     made = make_camera(camera)
-    taken = list(images_of_one_camera(images))
-    for file, image in taken:
-        check_size(file, image, camera.width_px, camera.height_px)
+    taken = list(images_of_one_camera(images, (camera.width_px, camera.height_px)))
     least = smallest_noise(taken[0][1])
     light = response_of([image for _, image in taken], response, openings_m)
     grey = [grey_levels(in_light(image, light.response)) for _, image in taken]

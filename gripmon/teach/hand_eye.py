@@ -27,7 +27,7 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, GripperError
-from gripmon.model.images import check_size, images_of_one_camera
+from gripmon.model.images import images_of_one_camera
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
@@ -109,10 +109,9 @@ class UnknownGripper:
         if rough is None:
             raise InputError("an unknown gripper needs rough corners")
         outline, camera = outlines_of(rough), make_camera(self.camera.lens)
-        corners, snapped = measure_outlines(camera, image, outline)
-        return ImageOnPlate(
-            calibrate_image(self.camera, sighting, corners, None), {}, replace(outline, points=snapped.points)
-        )
+        corners, points = measure_outlines(camera, image, outline)
+        found = calibrate_image(self.camera, sighting, corners, None)
+        return ImageOnPlate(found, {}, replace(outline, points=points))
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +268,7 @@ def calibrate_plane(
         if gripper is None
         else KnownGripper(given, gripper, checked_opening(gripper, jaw_opening_m), cam_T_grip)
     )
-    taken = _of_camera(images, given.lens)
+    taken = list(images_of_one_camera(images, (given.lens.width_px, given.lens.height_px)))
     light = response_of([image for _, image in taken], response)
     used: list[ImageOnPlate] = []
     shown: Image | None = None
@@ -324,13 +323,6 @@ def _notes(method: KnownGripper | UnknownGripper, given_m: float | None) -> tupl
     return tuple(notes)
 
 
-def _of_camera(images: Sequence[str | Path | Image], lens: LensSettings) -> list[tuple[str, Image]]:
-    taken = list(images_of_one_camera(images))
-    for name, image in taken:
-        check_size(name, image, lens.width_px, lens.height_px)
-    return taken
-
-
 def _for_each(corners: Rough | Sequence[Rough] | None, images: int) -> Sequence[Rough | None]:
     if corners is None or isinstance(corners, Mapping):
         return [corners] * images
@@ -362,7 +354,7 @@ def measure_tracked(
     the ``expected`` pose; and what is doubtful about it.  Images that contradict the others are left out;
     :class:`CalibrationError` if none can be measured, or no majority agrees.
     """
-    taken = _of_camera(images, camera)
+    taken = list(images_of_one_camera(images, (camera.width_px, camera.height_px)))
     made = make_camera(camera)
     cam_T_grip, covariance = expected
     # Where the camera has moved, a fit that starts at the calibration may end at a wrong pose.  So a second pass starts

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.records import Array, Image
-from gripmon.teach.drawing import Canvas, Colour, Labels, write
+from gripmon.teach.drawing import Labels, write
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.straight_pieces import Chain
 

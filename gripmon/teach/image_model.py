@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
-from gripmon.model.gripper import WIDEST_BEVEL_M, EdgeModel, FingerModel, GripperModel, JawModel, PointModel
+from gripmon.model.gripper import FingerModel, GripperModel, JawModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
 from gripmon.teach.curved_edges import smooth_curve
@@ -20,6 +22,7 @@ from gripmon.teach.image_motion import FingerMoved
 from gripmon.teach.image_outline import FingerSeen, OpeningSeen
 from gripmon.teach.inner_edges import InnerEdge
 from gripmon.teach.piece_lines import jackknife_sigma
+from gripmon.teach.shape import Shape, model_of
 from gripmon.teach.vanishing import PARALLEL_RAD, Outline
 from gripmon.track.edges.roles import PARALLEL_COSINE
 
@@ -112,53 +115,68 @@ def _tips_across(placed: PlacedOutlines) -> list[Array]:
 
 def build_model(seen: MeasuredGripper, name: str, provenance: Provenance | None, notes: list[str]) -> GripperModel:
     """The gripper file.  Raises :class:`NoResultError`; adds to ``notes`` what was left out."""
-    points: dict[str, PointModel] = {}
-    edges: dict[str, EdgeModel] = {}
-    dropped = inner_dropped = 0
-    parts = zip(seen.outlines, seen.placed.points, seen.placed.kept, seen.opening.fingers, strict=True)
-    for outline, places, placed, finger in parts:
-        dropped += len(outline.pieces) - len(placed)
-        long = dict(zip(outline.pieces, (outline.length_px >= SHORTEST_EDGE_PX).tolist(), strict=True))
-        curves = _curves(outline, placed, places @ seen.placed.rotation)
-        of_curves = {piece for curve in curves for piece in curve}
-        kept = [piece for piece in placed if long[piece] and piece not in of_curves]
-        places = places.copy()
-        vias = [_curve_in_space(seen, outline, finger.mask, places, curve, kept) for curve in curves]
-        local = ((places - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
-        met = np.bincount(np.ravel(kept).astype(int), minlength=len(local)) if kept else np.zeros(len(local), int)
-        known = sorted({k for piece in kept for k in piece} | {k for c in curves for k in (c[0][0], c[-1][1])})
-        for k in known:
-            x, y, z = (round(float(v), 7) for v in local[k])
-            corner = bool(outline.corner[k] and met[k] >= 2)
-            points[f"{outline.name}_{k}"] = PointModel(finger=outline.name, xyz_m=(x, y, z), corner=corner)
-        spread_m = _spreads_m(seen, finger)
-        for a, b in kept:
-            names = f"{outline.name}_{a}", f"{outline.name}_{b}"
-            edges[f"{outline.name}_{a}_{b}"] = EdgeModel(start=names[0], end=names[1], bevel_m=_width_m(spread_m[a, b]))
-        for curve, via in zip(curves, vias, strict=True):
-            first, last = (f"{outline.name}_{k}" for k in (curve[0][0], curve[-1][1]))
-            via_m = ((via - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
-            places_m = tuple((round(float(x), 7), round(float(y), 7), round(float(z), 7)) for x, y, z in via_m)
-            width_m = _width_m(float(np.sqrt(np.mean([spread_m[piece] ** 2 for piece in curve]))))
-            edges[f"{first}_{curve[-1][1]}"] = EdgeModel(start=first, end=last, via=places_m, bevel_m=width_m)
-        for number, edge in enumerate(finger.inner):
-            start = _starts_at(seen, outline, known, edge)
-            ends = _inner_in_space(seen, outline, places, start, edge)
-            if ends is None:
-                inner_dropped += 1
-                continue
-            _add_inner(seen, outline.name, number, ends, start, edge, points, edges)
+    parts = list(zip(seen.outlines, seen.placed.points, seen.placed.kept, seen.opening.fingers, strict=True))
+    shapes = {part[0].name: _shape(seen, *part) for part in parts}
+    dropped = sum(len(outline.pieces) - len(placed) for outline, _, placed, _ in parts)
     if dropped:
         notes.append(f"{dropped} outer edges behind the fingers' long edges aren't used: their depth isn't known")
+    inner_dropped = sum(len(finger.inner) - sum(shapes[outline.name].crease) for outline, _, _, finger in parts)
     if inner_dropped:
         notes.append(
             f"{inner_dropped} inner edges aren't used: they don't start from a corner, so their depth isn't known"
         )
-    fingers, jaw = _jaw(seen)
-    return GripperModel(
-        name=name, fingers=fingers, points=points, edges=edges, jaw=jaw, scale_sigma=seen.scale_sigma,
-        tilt_sigma_rad=round(seen.placed.tilt_sigma_rad, 4), provenance=provenance,
-    )  # fmt: skip
+    model = model_of(name, shapes, 0.0, *_jaw(seen), provenance)
+    tilt_sigma_rad = round(seen.placed.tilt_sigma_rad, 4)
+    return msgspec.structs.replace(model, scale_sigma=seen.scale_sigma, tilt_sigma_rad=tilt_sigma_rad)
+
+
+def _shape(
+    seen: MeasuredGripper, outline: Outline, places: Array, placed: Sequence[tuple[int, int]], finger: FingerSeen
+) -> Shape:
+    """A finger by the ``placed`` pieces of its outline, whose vertices are at ``places`` (v, 3) at unit depth: straight
+    edges, curves, and those of its inner edges whose depth is known.
+    """
+    long = dict(zip(outline.pieces, (outline.length_px >= SHORTEST_EDGE_PX).tolist(), strict=True))
+    curves = _curves(outline, placed, places @ seen.placed.rotation)
+    of_curves = {piece for curve in curves for piece in curve}
+    kept = [piece for piece in placed if long[piece] and piece not in of_curves]
+    places = places.copy()
+    vias: list[Array] = [np.zeros((0, 3))] * len(kept)
+    vias += [_curve_in_space(seen, outline, finger.mask, places, curve, kept) for curve in curves]
+    edges = [*kept, *((curve[0][0], curve[-1][1]) for curve in curves)]
+    piece_m = _spreads_m(seen, finger)
+    spread_m = [piece_m[piece] for piece in kept]
+    spread_m += [float(np.sqrt(np.mean([piece_m[piece] ** 2 for piece in curve]))) for curve in curves]
+    met = np.bincount(np.ravel(kept).astype(int), minlength=len(places))
+    known = sorted({k for edge in edges for k in edge})
+    outer = len(edges)
+    brighter: dict[int, Literal["left", "right"]] = {}
+    for edge in finger.inner:
+        start = _starts_at(seen, outline, known, edge)
+        ends = _inner_in_space(seen, outline, places, start, edge)
+        if ends is None:
+            continue
+        own = [len(places), len(places) + 1]
+        if start is not None:
+            own[start[1]] = start[0]
+        places = np.vstack([places, ends])
+        brighter[len(edges)] = "right" if edge.step > 0.0 else "left"
+        edges.append((own[0], own[1]))
+    inner = len(edges) - outer
+    return Shape(
+        points_m=_in_gripper(seen, places),
+        corners={k for k in known if outline.corner[k] and met[k] >= 2},
+        edges=edges,
+        crease=[False] * outer + [True] * inner,
+        spread_m=spread_m + [0.0] * inner,
+        via_m=[_in_gripper(seen, via) for via in vias] + [np.zeros((0, 3))] * inner,
+        brighter=brighter,
+    )
+
+
+def _in_gripper(seen: MeasuredGripper, places: Array) -> Array:
+    """Points (n, 3) at unit depth in the gripper's frame, m."""
+    return np.asarray(((places - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m)
 
 
 def _spreads_m(seen: MeasuredGripper, finger: FingerSeen) -> dict[tuple[int, int], float]:
@@ -173,11 +191,6 @@ def _spreads_m(seen: MeasuredGripper, finger: FingerSeen) -> dict[tuple[int, int
             out[first + a, first + b] = sigma_px / seen.camera.fx_px * seen.depth_m
         first += len(chain.uv_px)
     return out
-
-
-def _width_m(spread_m: float) -> float:
-    """Width within which an edge of a standard deviation lies evenly spread."""
-    return round(min(math.sqrt(12.0) * spread_m, WIDEST_BEVEL_M), 7)
 
 
 def _curves(outline: Outline, placed: Sequence[tuple[int, int]], local: Array) -> list[list[tuple[int, int]]]:
@@ -276,29 +289,6 @@ def _inner_in_space(
     if abs(float(way @ along)) < math.cos(2.0 * PARALLEL_RAD) * float(np.linalg.norm(way) * np.linalg.norm(along)):
         return None
     return np.array([nearest_on_ray(ray, places[start[0]], direction) for ray in rays])
-
-
-def _add_inner(
-    seen: MeasuredGripper,
-    finger: str,
-    number: int,
-    ends: Array,
-    start: tuple[int, int] | None,
-    edge: InnerEdge,
-    points: dict[str, PointModel],
-    edges: dict[str, EdgeModel],
-) -> None:
-    local = ((ends - seen.placed.tcp) @ seen.placed.rotation) * seen.depth_m
-    names = [f"{finger}_inner_{number}_{side}" for side in ("a", "b")]
-    for end, place in enumerate(local):
-        if start is not None and start[1] == end:
-            names[end] = f"{finger}_{start[0]}"
-            continue
-        x, y, z = (round(float(v), 7) for v in place)
-        points[names[end]] = PointModel(finger=finger, xyz_m=(x, y, z))
-    edges[f"{finger}_inner_{number}"] = EdgeModel(
-        start=names[0], end=names[1], kind="crease", brighter="right" if edge.step > 0.0 else "left"
-    )
 
 
 def _jaw(seen: MeasuredGripper) -> tuple[dict[str, FingerModel], JawModel | None]:

@@ -136,18 +136,15 @@ class Kept(msgspec.Struct, frozen=True):
     @property
     def excess(self) -> float:
         """The larger of the bounds that nine of ten images keep, over its alert limit; infinite where there is none."""
-        sizes = self.sizes
-        if sizes.most_m is None or sizes.most_rad is None:
-            return math.inf
-        return max(sizes.most_m / self.alert_limit_m, sizes.most_rad / self.alert_limit_rad)
+        return self._over_limits(self.sizes.most_m, self.sizes.most_rad)
 
     @property
     def median_excess(self) -> float:
         """The same of the median."""
-        sizes = self.sizes
-        if sizes.median_m is None or sizes.median_rad is None:
-            return math.inf
-        return max(sizes.median_m / self.alert_limit_m, sizes.median_rad / self.alert_limit_rad)
+        return self._over_limits(self.sizes.median_m, self.sizes.median_rad)
+
+    def _over_limits(self, m: float | None, rad: float | None) -> float:
+        return math.inf if m is None or rad is None else max(m / self.alert_limit_m, rad / self.alert_limit_rad)
 
     @property
     def reachable(self) -> bool:

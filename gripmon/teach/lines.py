@@ -4,7 +4,7 @@ have in common; and the depth of an edge.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,7 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
     shifts = np.arange(-round(reach_px / _STEP_PX), round(reach_px / _STEP_PX) + 1) * _STEP_PX
     starts = np.array([expected_px + s + 0.5 * t * np.array([-1.0, 1.0]) for s in shifts for t in _TILTS_PX])
     away = np.abs(starts.mean(axis=1) - expected_px.mean())
-    support = _support(points, starts)
+    support = support_of(points, starts)
     score = support * (1.0 - 0.5 * np.square(away / (reach_px + _STEP_PX)))
     best = int(score.argmax())
     line = settle_line(points, starts[best])
@@ -79,7 +79,7 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
     rival_px = None
     if len(rivals):
         rival_px = float(starts[rivals[support[rivals].argmax()]].mean() - line.ends_px.mean())
-    return Line(line.ends_px, line.covariance_px2, line.inlier, line.rms_px, line.seen, rival_px)
+    return replace(line, rival_px=rival_px)
 
 
 def settle_line(points: EdgePoints, start_px: Array) -> Line | None:
@@ -130,11 +130,13 @@ def of_image(points: EdgePoints, image: int) -> EdgePoints:
     )
 
 
-def _support(points: EdgePoints, starts: Array) -> Array:
-    """Sum (s,) over all points of a weight that decreases with their distance from each line (s, 2)."""
+def support_of(points: EdgePoints, starts: Array, worth: Array | None = None) -> Array:
+    """Sum (s,) over all points of a weight that decreases with their distance from each line (s, 2), times their
+    ``worth`` (k,), if they differ in it.
+    """
     lines = starts[:, :1] * (1.0 - points.way) + starts[:, 1:] * points.way
     nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
-    return np.asarray(nearness.sum(axis=1))
+    return np.asarray(nearness.sum(axis=1) if worth is None else nearness @ worth)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ rough ends may be off by several pixels each in any direction.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from gripmon.calibrate.plane import FingerCorners
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
-from gripmon.teach.lines import EdgePoints, Line, settle_line
+from gripmon.teach.lines import EdgePoints, Line, settle_line, support_of
 from gripmon.teach.outlines import Outline
 from gripmon.track.edges.kernel import FEWEST_FREE
 from gripmon.track.edges.prediction import ROWS, STRETCH
@@ -42,54 +42,46 @@ SEEN_SHARE = 0.4
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
 _GRID_PX = 0.5
-_START_PX = 1.0
 _ROUNDS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class FoundOutline:
-    """``points`` (p, 2) of the outline on its measured edges, px; ``covariance_px2`` (2c, 2c) of its c corners, u and v
-    of the first, then of the next; ``seen`` (e,) part of each edge that shows it, ``rms_px`` (e,) of its points.
+class SeenEdge(NamedTuple):
+    """An edge between two rough ends: its ``line`` beside ``uv_px`` (n, 2), where it was looked for along ``normal``
+    (n, 2), to the right when going from the first end; the ``points`` (k,) it was chosen from, and the median
+    ``width_px`` of those on it.
     """
 
-    points: Array
-    covariance_px2: Array
-    seen: Array
-    rms_px: Array
-
-
-@dataclass(frozen=True, slots=True)
-class _Base:
-    """An edge between two rough ends as the lens shows it: ``uv_px`` (n, 2) and ``normal`` (n, 2), to the right when
-    going from the first end; ``way`` (n,) from 0 to 1 between the ends of the sampled part.
-    """
-
+    line: Line
+    points: EdgePoints
     uv_px: Array
     normal: Array
-    way: Array
+    width_px: float
+
+    def at_px(self, offsets_px: Array) -> Array:
+        """The places (2, 2) at these offsets (2,) from both ends of the part that was looked at."""
+        return np.asarray(self.uv_px[[0, -1]] + offsets_px[:, None] * self.normal[[0, -1]])
 
 
-def find_outline(camera: Camera, image: Image, outline: Outline) -> FoundOutline:
-    """The outline on the edges that the image shows.  Raises :class:`CalibrationError` with the name of the corner or
-    edge that is outside of the image, not seen, or not a corner.
+def measure_outlines(camera: Camera, image: Image, outline: Outline) -> tuple[FingerCorners, Array]:
+    """Corners of an unknown gripper's fingertips, from their rough outlines, and all of the outline's points (p, 2) on
+    the edges that the image shows, px.  Raises :class:`CalibrationError` with the name of the corner or edge that is
+    outside of the image, not seen, or not a corner.
     """
     points = outline.points
     _check_inside(camera, outline)
     for turn in range(_ROUNDS):
-        seen, bases = [], []
+        seen = []
         for a, b in outline.edges:
             names = f"{outline.names[a]} to {outline.names[b]}"
-            base, reach_px = _lay(camera, points[a], points[b], REACH_PX if turn == 0 else FINAL_REACH_PX, names)
-            seen.append(_line(camera, image, base, reach_px, names, anywhere=turn == 0))
-            bases.append(base)
-        found = _meet(camera, outline, points, bases, [edge.line.ends_px for edge in seen])
+            seen.append(_edge(camera, image, points[[a, b]], names, anywhere=turn == 0))
+        found = _meet(camera, outline, points, [edge.at_px(edge.line.ends_px) for edge in seen])
         moved_px = float(np.linalg.norm(found - points, axis=1).max())
         points = found
         if turn and moved_px < 0.05:
             break
-    covariance = _covariance(camera, outline, points, bases, seen)
-    lines = [edge.line for edge in seen]
-    return FoundOutline(points, covariance, np.array([n.seen for n in lines]), np.array([n.rms_px for n in lines]))
+    corners = list(outline.corners)
+    names_of = tuple(outline.names[k] for k in corners)
+    return FingerCorners(names_of, points[corners], _covariance(camera, outline, points, seen)), points
 
 
 def _check_inside(camera: Camera, outline: Outline) -> None:
@@ -101,81 +93,72 @@ def _check_inside(camera: Camera, outline: Outline) -> None:
             )
 
 
-def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) -> tuple[_Base, float]:
-    """Sample points one pixel apart, leaving out a margin at both ends; and the search distance for this length."""
-    length_px = float(np.linalg.norm(end - start))
+def _edge(camera: Camera, image: Image, ends_px: Array, names: str, *, anywhere: bool) -> SeenEdge:
+    length_px = float(np.linalg.norm(ends_px[1] - ends_px[0]))
     if not length_px >= SHORTEST_PX:
         raise CalibrationError(f"{names}: {length_px:.0f} px apart; at least {SHORTEST_PX:g} px, two different corners")
-    reach_px = max(min(reach_px, LARGEST_REACH_SHARE * length_px), 4.0)
-    xy = camera.undistort(np.stack([start, end]))
-    if not np.isfinite(xy).all():
+    if not np.isfinite(camera.undistort(ends_px)).all():
         raise CalibrationError(f"{names}: beyond what the lens maps; corners in the image")
-    margin = min(END_MARGIN_PX, 0.2 * length_px) / length_px
+    reach_px = max(min(REACH_PX if anywhere else FINAL_REACH_PX, LARGEST_REACH_SHARE * length_px), 4.0)
+    found = edge_between(camera, image, ends_px, reach_px, END_MARGIN_PX, anywhere=anywhere)
+    if found is None or found.line.seen < SEEN_SHARE:
+        shown = 0.0 if found is None else 100.0 * found.line.seen
+        raise CalibrationError(
+            f"{names}: its edge is visible along {shown:.0f} % of it within {reach_px:.0f} px; at least "
+            f"{100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, an image in focus"
+        )
+    return found
+
+
+def edge_between(
+    camera: Camera, image: Image, ends_px: Array, reach_px: float, margin_px: float, *, anywhere: bool = False
+) -> SeenEdge | None:
+    """The edge between two rough ends (2, 2) on search lines of this reach, one pixel apart, leaving out a margin at
+    both ends; ``anywhere``: in any direction within the reach, else near the ends.  None where none is seen.
+    """
+    length_px = float(np.linalg.norm(ends_px[1] - ends_px[0]))
+    margin = min(margin_px, 0.2 * length_px) / length_px
     fraction = np.linspace(margin, 1.0 - margin, max(int(length_px * (1.0 - 2.0 * margin)), 8))
-    uv_px = camera.distort(xy[0] + fraction[:, None] * (xy[1] - xy[0]))
-    tangent = np.gradient(uv_px, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    return _Base(uv_px, normal, np.linspace(0.0, 1.0, len(fraction))), reach_px
-
-
-def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str, *, anywhere: bool) -> SeenEdge:
+    start, end = camera.undistort(ends_px)
+    uv_px = camera.distort(start + fraction[:, None] * (end - start))
+    along = np.gradient(uv_px, axis=0)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
     offsets = profile_offsets_px(reach_px + 3.0)
     row = np.arange(-(ROWS // 2), ROWS // 2 + 1)[:, None, None]
-    along = np.column_stack([base.normal[:, 1], -base.normal[:, 0]])
-    maps = [
-        (base.uv_px[:, k, None] + base.normal[:, k, None] * offsets + row * along[:, k, None]).astype(np.float32)
-        for k in (0, 1)
-    ]
+    maps = [(uv_px[:, k, None] + normal[:, k, None] * offsets + row * along[:, k, None]) for k in (0, 1)]
     last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
-    ok = np.all((base.uv_px >= 1.0) & (base.uv_px <= last_px - 1.0), axis=1)
-    profiles = read_profiles(image, maps[0], maps[1])
+    ok = np.all((uv_px >= 1.0) & (uv_px <= last_px - 1.0), axis=1)
+    profiles = read_profiles(image, *(one.astype(np.float32) for one in maps))
     noise = estimate_noise(profiles, quantum(image))
     found = find_candidates(profiles, ok, noise, full_scale(image), EdgeSettings())
     near = np.abs(found.offset_px) <= reach_px + 1.0
     sample = found.sample[near]
-    points = EdgePoints(
-        base.way[sample],
-        found.offset_px[near],
-        found.step[near],
-        sample,
-        np.zeros(len(sample), np.intp),
-        np.array([int(ok.sum())]),
-    )
-    worth = np.sqrt(np.abs(points.step))
-    start = _start(points, worth, reach_px) if anywhere and len(sample) else np.zeros(2)
-    line = settle_line(points, start) if len(sample) else None
-    if line is None or line.seen < SEEN_SHARE:
-        seen = 0.0 if line is None else 100.0 * line.seen
-        raise CalibrationError(
-            f"{names}: its edge is visible along {seen:.0f} % of it within {reach_px:.0f} px; at least "
-            f"{100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, an image in focus"
-        )
-    return SeenEdge(line, points, np.asarray(found.width_px[near]))
+    way, of_one = np.linspace(0.0, 1.0, len(fraction)), np.zeros(len(sample), np.intp)
+    points = EdgePoints(way[sample], found.offset_px[near], found.step[near], sample, of_one, np.array([int(ok.sum())]))
+    line = settle_line(points, _start(points, reach_px) if anywhere and len(sample) else np.zeros(2))
+    if line is None:
+        return None
+    return SeenEdge(line, points, uv_px, normal, float(np.median(found.width_px[near][line.inlier])))
 
 
-def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
-    """The line (2,), its offsets at both ends, that most points support, weighted by ``worth`` (k,); of similar ones
+def _start(points: EdgePoints, reach_px: float) -> Array:
+    """The line (2,), its offsets at both ends, that most points support, those of a high step more; of similar ones
     the closest to the rough line.
     """
     steps = np.arange(-reach_px, reach_px + 0.5 * _GRID_PX, _GRID_PX)
     ends = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    support = np.zeros(len(ends))
-    for k in range(0, len(ends), 256):
-        part = ends[k : k + 256]
-        lines = part[:, :1] * (1.0 - points.way) + part[:, 1:] * points.way
-        nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
-        support[k : k + 256] = nearness @ worth
+    support = support_of(points, ends, np.sqrt(np.abs(points.step)))
     away = np.square(ends).mean(axis=1) / reach_px**2
     best: Array = ends[int((support * (1.0 - 0.3 * away)).argmax())]
     return best
 
 
-def _meet(camera: Camera, outline: Outline, points: Array, bases: list[_Base], ends_px: list[Array]) -> Array:
-    """The outline's points moved to the intersections of their edges' lines; the end of a single edge to its foot on
-    the line.
+def _meet(camera: Camera, outline: Outline, points: Array, edges_px: Sequence[Array]) -> Array:
+    """The outline's points moved to the intersections of their edges' lines, each through two places (2, 2); the end
+    of a single edge to its foot on the line.
     """
-    lines = [_ideal_line(camera, base, ends) for base, ends in zip(bases, ends_px, strict=True)]
+    lines = [_ideal_line(camera, edge_px) for edge_px in edges_px]
     out = points.copy()
     for k, name in enumerate(outline.names):
         own = [lines[e] for e, edge in enumerate(outline.edges) if k in edge]
@@ -192,28 +175,25 @@ def _meet(camera: Camera, outline: Outline, points: Array, bases: list[_Base], e
     return out
 
 
-def _ideal_line(camera: Camera, base: _Base, ends_px: Array) -> tuple[Array, float]:
+def _ideal_line(camera: Camera, edge_px: Array) -> tuple[Array, float]:
     """Unit normal (2,) and distance from the origin, in ideal coordinates."""
-    where = base.uv_px[[0, -1]] + ends_px[:, None] * base.normal[[0, -1]]
-    first, last = camera.undistort(where)
+    first, last = camera.undistort(edge_px)
     along = (last - first) / np.linalg.norm(last - first)
     normal = np.array([-along[1], along[0]])
     return normal, float(normal @ first)
 
 
-def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Base], seen: list[SeenEdge]) -> Array:
+def _covariance(camera: Camera, outline: Outline, points: Array, seen: Sequence[SeenEdge]) -> Array:
     """Covariance (2c, 2c) of the corners, from those of their lines."""
     corners = list(outline.corners)
     out = np.zeros((2 * len(corners), 2 * len(corners)))
-    ends_px = [edge.line.ends_px for edge in seen]
     for e, covariance in enumerate(line_covariances(seen)):
         for column in np.linalg.cholesky(covariance).T:
-            shifted = [
-                _meet(
-                    camera, outline, points, bases, [x + (s * column if k == e else 0.0) for k, x in enumerate(ends_px)]
-                )
-                for s in (0.5, -0.5)
-            ]
+            shifted = []
+            for s in (0.5, -0.5):
+                offsets = [n.line.ends_px + (s * column if k == e else 0.0) for k, n in enumerate(seen)]
+                places = [n.at_px(own) for n, own in zip(seen, offsets, strict=True)]
+                shifted.append(_meet(camera, outline, points, places))
             slope = (shifted[0] - shifted[1])[corners].ravel()
             out += np.outer(slope, slope)
     return out
@@ -221,21 +201,6 @@ def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Ba
 
 _LEAST_PX = 0.01
 """Least standard deviation of a point: no image gives it better."""
-
-
-@dataclass(frozen=True, slots=True)
-class SeenEdge:
-    """A line with the ``points`` (k,) it was chosen from, and their edges' ``width_px`` (k,)."""
-
-    line: Line
-    points: EdgePoints
-    width_px: Array
-
-    def design(self) -> tuple[Array, Array]:
-        """Rows (m, 2) and values (m,) of the least squares whose solution is the line."""
-        inlier = self.line.inlier
-        way = self.points.way[inlier]
-        return np.column_stack([1.0 - way, way]), self.points.offset_px[inlier]
 
 
 def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
@@ -250,37 +215,31 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
 
     The error that all points of an edge share, which residuals don't show, is added.
     """
-    squares, freedom = np.array([_stretches(edge) for edge in seen]).T
-    free = float(freedom.sum())
+    designs, squares, freedom = zip(*map(_stretches, seen), strict=True)
+    free = float(sum(freedom))
     # v is known from few stretches only: Student's distribution has this variance.
     student = free / (free - 2.0) if free >= FEWEST_FREE else FEWEST_FREE
-    usual_px2 = student * float(squares.sum()) / max(free, 1.0)
+    usual_px2 = student * float(sum(squares)) / max(free, 1.0)
     floor_px = RobustFitSettings().edge_floor_px
     out = []
-    for edge, own, count in zip(seen, squares, freedom, strict=True):
-        design = edge.design()[0]
+    for edge, design, own, count in zip(seen, designs, squares, freedom, strict=True):
         variance_px2 = max(usual_px2, own / max(count, 1.0), _LEAST_PX**2)
-        shared_px = floor_px * max(float(np.median(edge.width_px[edge.line.inlier])), 1.0)
-        out.append(variance_px2 * np.linalg.inv(design.T @ design) + shared_px**2)
+        out.append(variance_px2 * np.linalg.inv(design.T @ design) + (floor_px * max(edge.width_px, 1.0)) ** 2)
     return out
 
 
-def _stretches(edge: SeenEdge) -> tuple[float, float]:
-    """Sum of squares of the stretches' residuals, and what it would be for independent points of unit variance."""
+def _stretches(edge: SeenEdge) -> tuple[Array, float, float]:
+    """The design (m, 2) of an edge's line, the sum of squares of its stretches' residuals, and what that would be for
+    independent points of unit variance.
+    """
     inlier = edge.line.inlier
-    design, values = edge.design()
-    residual = values - design @ edge.line.ends_px
+    way = edge.points.way[inlier]
+    design = np.column_stack([1.0 - way, way])
+    residual = edge.points.offset_px[inlier] - design @ edge.line.ends_px
     member = edge.points.profile[inlier] // STRETCH
     stretch = (member[:, None] == np.unique(member)).astype(np.float64)
     stretch /= np.sqrt(stretch.sum(axis=0))
     # The line's two unknowns reduce it: tr(S' (I - P) S).
     basis = np.linalg.qr(design)[0]
-    return float(np.square(stretch.T @ residual).sum()), float(stretch.shape[1] - np.square(basis.T @ stretch).sum())
-
-
-def measure_outlines(camera: Camera, image: Image, outline: Outline) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of an unknown gripper's fingertips, from their rough outlines; errors as in :func:`find_outline`."""
-    snapped = find_outline(camera, image, outline)
-    corners = list(outline.corners)
-    names = tuple(outline.names[k] for k in corners)
-    return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped
+    free = float(stretch.shape[1] - np.square(basis.T @ stretch).sum())
+    return design, float(np.square(stretch.T @ residual).sum()), free

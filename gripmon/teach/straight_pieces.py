@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
@@ -97,8 +98,7 @@ def runs(usable: NDArray[np.bool_], uv_px: Array) -> list[tuple[NDArray[np.intp]
 def without_outliers(offset_px: Array, chain: NDArray[np.intp]) -> NDArray[np.intp]:
     """A chain's points without those far from the median of their neighbours."""
     values = offset_px[chain]
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, 5, mode="edge"), 11)
-    return chain[np.abs(values - np.median(windows, axis=1)) < _OUTLIER_PX]
+    return chain[np.abs(values - median_filter(values, 11, mode="nearest")) < _OUTLIER_PX]
 
 
 def split(points: Array) -> list[int]:

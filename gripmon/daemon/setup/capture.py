@@ -16,6 +16,7 @@ from gripmon.daemon.setup.views import MOVED_PX, Coverage, View, Viewer, coverag
 from gripmon.io.sources import Source, Waiting
 from gripmon.io.sources.files import TIMESTAMPS_NAME, TableRow, read_table, table_of
 from gripmon.model.atomic import write_atomically
+from gripmon.model.canvas import Canvas
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.images import IMAGE_SUFFIXES, natural_key, read_image
 from gripmon.model.records import Frame, Image
@@ -136,10 +137,9 @@ class Capture:
         found = newest[1].sighting
         if not isinstance(found, Sighting):
             return encoded(grey, ".jpg")
-        shown = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-        for u, v in found.uv_px.round().astype(int).tolist():
-            cv2.circle(shown, (u, v), max(2, shown.shape[1] // 250), _GREEN, -1, cv2.LINE_AA)
-        return encoded(shown, ".jpg")
+        canvas = Canvas(grey, 1.0)
+        canvas.circle(found.uv_px, max(2.0, grey.shape[1] / 250.0), _GREEN, -1)
+        return encoded(canvas.picture, ".jpg")
 
     def state(self) -> CaptureState:
         """For the page."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gripmon.model.geometry import make_transform, perturb, perturbation_between, skew
+from gripmon.model.geometry import make_transform, perturb, perturbation_between, seen_from
 from gripmon.model.gripper import on_a_line
 from gripmon.model.least_squares import joint_weight
 from gripmon.model.records import Array
@@ -134,14 +134,8 @@ def _refine(
 ) -> Recalibration | None:
     """Gauss-Newton on the weighted image error, on the manifold; None if it fails or ends behind the camera."""
     for _ in range(iterations):
-        levers = points_grip_m @ cam_T_grip[:3, :3].T
-        points = levers + cam_T_grip[:3, 3]
-        xy = points[:, :2] / points[:, 2:]
-        d_xy = np.zeros((len(points), 2, 3))
-        d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1.0 / points[:, 2]
-        d_xy[:, :, 2] = -xy / points[:, 2:]
-        jacobian = np.concatenate([d_xy, -d_xy @ skew(levers)], axis=2).reshape(-1, 6)
-        residual = (measured_xy - xy).ravel()
+        xy, rows = seen_from(cam_T_grip, points_grip_m)
+        jacobian, residual = rows.reshape(-1, 6), (measured_xy - xy).ravel()
         weighted = weight_xy @ jacobian
         normal = jacobian.T @ weighted
         try:

@@ -12,7 +12,7 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import invert
-from gripmon.model.gripper import UNTOLD_BEVEL_M, WIDEST_BEVEL_M, Gripper, GripperError
+from gripmon.model.gripper import UNTOLD_BEVEL_M, WIDEST_BEVEL_M, FingerModel, Gripper, GripperError
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array
@@ -22,10 +22,10 @@ from gripmon.teach.cad.frame import AXES, axes_of, check_level, frame_of
 from gripmon.teach.cad.jaw import jaw_of
 from gripmon.teach.cad.outline import outline_shape
 from gripmon.teach.cad.parts import LONGEST_M, STRAIGHT_NOTE, Parts, read_parts
-from gripmon.teach.cad.solid import Shape, cut, is_solid, solid_shape
+from gripmon.teach.cad.solid import cut, is_solid, solid_shape
 from gripmon.teach.cad.surface import Surface
-from gripmon.teach.cad.written import model_of
 from gripmon.teach.result import GripperResult
+from gripmon.teach.shape import Shape, model_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,9 @@ def gripper_from_cad(
         notes.append(STRAIGHT_NOTE)
     notes += [f"{each}: its edges are those of this view; make it again for another" for each in seen]
     jaw = None if jaw is None else jaw.turned(grip_T_tip[:3, :3])
-    model = model_of(name or Path(files[0]).stem, shapes, bevel_m, jaw, provenance)
+    moving = {finger: FingerModel(motion=None if jaw is None else jaw.motion(finger)) for finger in shapes}
+    called = name or Path(files[0]).stem
+    model = model_of(called, shapes, bevel_m, moving, None if jaw is None else jaw.model, provenance)
     try:
         gripper = Gripper(model)
     except GripperError as error:

@@ -43,8 +43,6 @@ def read_mesh(path: Path, unit: str | None, *, size: bool = True) -> Trimesh:
     of these formats only DAE contains it.  Its up axis is ignored, as ROS does.
     """
     trimesh = mesh_library(str(path))
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; a mesh ({', '.join(MESHES)}), URDF or .cao")
     collada = path.suffix.lower() == ".dae"
     if collada and importlib.util.find_spec("collada") is None:
         raise InputError(f"{path}: needs the package pycollada; pip install 'gripmon[cad]'")

@@ -124,11 +124,7 @@ def read_urdf(path: Path, joint: str | None) -> Linkage:
 
 def _carried(urdf: Urdf, base: str, joint: Joint) -> Array:
     """``base_T_joint`` (4, 4), all joints at zero."""
-    transform = joint.origin
-    link = joint.parent
-    while link != base and (holding := next((j for j in urdf.joints if j.child == link), None)) is not None:
-        transform, link = holding.placed({}) @ transform, holding.parent
-    return transform
+    return urdf.carried(base, joint.parent, {}) @ joint.origin
 
 
 def _free(urdf: Urdf) -> list[Joint]:

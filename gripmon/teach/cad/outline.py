@@ -21,8 +21,9 @@ from gripmon.model.gripper.rounds import LARGEST_RADIUS_M
 from gripmon.model.records import Array
 from gripmon.teach.cad.curves import Curve, curves_of, pieces_of
 from gripmon.teach.cad.depth import DepthMap, Pinhole
-from gripmon.teach.cad.solid import REAR_M, Shape
+from gripmon.teach.cad.solid import REAR_M
 from gripmon.teach.cad.surface import Surface
+from gripmon.teach.shape import Shape
 
 STEP_PX = 0.5
 """Distance of the points at which a curve is sampled."""

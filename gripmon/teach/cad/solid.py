@@ -2,52 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-
 import numpy as np
 
 from gripmon.model.gripper.faces import normal_of
-from gripmon.model.records import Array
 from gripmon.teach.cad.files import mesh_library
 from gripmon.teach.cad.surface import FLAT_M, Surface, surface_of
+from gripmon.teach.shape import Shape
 
 MOST_FACES = 64
 """Most faces of a finger; more are a coarsely cut rounding."""
 
 REAR_M = 5e-4
 """Distance from a finger's rear end within which edges are left out: it is mounted there, and they aren't seen."""
-
-
-@dataclass(slots=True)
-class Shape:
-    """One finger in the gripper frame: ``points_m`` (p, 3), which of them are ``corners``, ``edges`` as pairs of points
-    with ``crease`` or not, ``loops`` of faces.  ``round_m``: by point, centre and axis of the rounding it lies on.
-    ``spread_m``: by edge, the standard deviation of a round part's observed outline from it, 0 for a sharp edge; empty
-    where all are sharp.
-    ``via_m``: by edge, the points (n, 3) that a curved one passes between its ends; empty where none is curved.
-    """
-
-    points_m: Array
-    corners: set[int]
-    edges: list[tuple[int, int]]
-    crease: list[bool]
-    loops: list[list[int]] = field(default_factory=list)
-    round_m: dict[int, tuple[Array, Array]] = field(default_factory=dict)
-    spread_m: list[float] = field(default_factory=list)
-    via_m: list[Array] = field(default_factory=list)
-
-    def moved(self, to_T_shape: Array) -> Shape:
-        """The same in another frame (4, 4)."""
-        rotation, translation = to_T_shape[:3, :3], to_T_shape[:3, 3]
-        rounds: dict[int, tuple[Array, Array]] = {
-            k: (centre @ rotation.T + translation, axis @ rotation.T) for k, (centre, axis) in self.round_m.items()
-        }
-        return replace(
-            self,
-            points_m=self.points_m @ rotation.T + translation,
-            round_m=rounds,
-            via_m=[via @ rotation.T + translation for via in self.via_m],
-        )
 
 
 def is_solid(surface: Surface) -> bool:

@@ -100,13 +100,14 @@ class Urdf:
 
     def placed(self, base: str, values: dict[str, float]) -> dict[str, Array]:
         """``base_T_link`` of every link with a geometry that ``base`` carries, the joints at ``values``."""
-        out = {}
-        for name in self.shown:
-            way = self.up(name)
-            if base in way:
-                carried = [self._holding[link].placed(values) for link in way[: way.index(base)]]
-                out[name] = np.linalg.multi_dot([np.eye(4), *reversed(carried), np.eye(4)])
-        return out
+        return {name: self.carried(base, name, values) for name in self.shown if base in self.up(name)}
+
+    def carried(self, base: str, link: str, values: dict[str, float]) -> Array:
+        """``base_T_link`` (4, 4) of a link that ``base`` carries."""
+        way, base_T_link = self.up(link), np.eye(4)
+        for each in way[: way.index(base)]:
+            base_T_link = self._holding[each].placed(values) @ base_T_link
+        return base_T_link
 
     def up(self, link: str) -> list[str]:
         """The link, its parent, and so on."""
