@@ -320,7 +320,7 @@ def test_a_frames_bounds_are_those_of_numpy(kinds: int, displaced: bool, unwatch
     many = 0 if displaced else 5
     lasting = tuple(fits(rng, many)), from_T, origin_T, origin, wander, rng.integers(-1, count, many), prior[1, :many]
     of = frame, (prior[0], *some[:2]), prior[0] * some[3], besides, before, (axis, count - 1, 0.5, 1e-3, 0.1)
-    what = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-7
+    what = cam_T_grip, displaced, *of, lasting, prior[2, :5], 1e-7, 3e-7
     cases, counts, spread, left = frame_kernel.gathered(1e-5, 1.44, *what)
     expected, numbers, knock, out = by_numpy.gathered(1e-5, 1.44, *what)
     probable = expected[3] > 1e-6

@@ -597,9 +597,7 @@ def test_the_picture_of_a_creep_shows_it():
 
 def test_what_is_not_used_is_not_shown_in_green():
     points = np.stack([np.arange(20.0, 300.0, 4.0), np.full(70, 100.0)], axis=1).astype(np.float32)
-    picture = Picture(
-        7, START_NS, np.zeros((240, 320), np.uint8), "image/png", points, points[:0], (points[:2],), points[:0], ()
-    )
+    picture = Picture(7, START_NS, np.zeros((240, 320), np.uint8), points, points[:0], (points[:2],), ())
     green = []
     for used in (True, False):
         (shown,) = cut_alike([picture], [used])

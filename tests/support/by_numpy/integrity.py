@@ -362,13 +362,14 @@ def telling(
 def gathered(
     _risk: float, times: float, cam_T_grip: Array, displaced: bool, frame: tuple, doubts: tuple, solved: Array,
     bare: tuple, known: tuple, of_knocks: tuple, lasting: tuple, first_prior: Array, least: float,
+    unsolved: float,
 ) -> tuple[tuple, tuple[int, int, int], Array, float]:  # fmt: skip
     fit_T, alone, anchored, covariance, floor = frame
     axis, ends, cosine, *odds = of_knocks
     average, from_T, origin_T, origin, wander, rows, lasting_prior = lasting
     share, jumps, along, spread = kinds_of(least_known(covariance[ends], axis, cosine))
     away = perturbation_between(fit_T, cam_T_grip)
-    h, b, g, many, nowhere, left_out = len(solved), len(bare[1][0]), len(rows), len(first_prior), np.zeros(6), 0.0
+    h, b, g, many, nowhere, left_out = len(solved), len(bare[1][0]), len(rows), len(first_prior), np.zeros(6), unsolved
     here = np.flatnonzero(doubts[1])
     # The fits, which of them, the pose that they count from, what their covariances lack, priors, names.
     sets, counts = [(anchored, here, away, floor, doubts[0][here], here)], [len(here)]
