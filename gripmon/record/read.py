@@ -77,7 +77,7 @@ def needed_recordings(paths: Sequence[Path], progress: Progress | None = None) -
             raise InputError(f"{path}: there is no such file; {right}")
     found = open_recordings(paths, progress)
     if not found.recordings:
-        named = any(path.suffix.lower() in (_SUFFIX, _LINES_SUFFIX) for path in paths)
+        named = any(p.suffix.lower() in (_SUFFIX, _LINES_SUFFIX) or (p.is_dir() and recordings_below(p)) for p in paths)
         raise (NoResultError if named else InputError)("; ".join(found.faults) or "no recording (.rrd) there")
     return found
 
