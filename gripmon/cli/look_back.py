@@ -53,7 +53,7 @@ _EXPORT_EXAMPLES = """\
   gripmon export recordings/arm1-*.rrd recordings/arm2-*.rrd --out fleet
 
 exit codes: 0 done, also if a part of a recording could not be used (one line each on stderr);
-2 wrong usage; 3 nothing in it could be used, or the folder could not be written"""
+2 wrong usage, or a folder that may not be written; 3 nothing in it could be used, or writing failed"""
 
 _CORRECT_OPTIONS = """
 RECORDING...       recordings (.rrd), folders of them (searched recursively), or estimates.jsonl
