@@ -53,6 +53,14 @@ def test_a_face_as_grey_as_the_background_is_added_and_what_changes_taken_away()
         assert not ((part != true) & (beside == 0)).any(), "but for 4 px on either side of its border"
 
 
+def test_outside_of_a_persons_boxes_nothing_is_added() -> None:
+    """As around fingers without what they hold, which stays as well."""
+    parts = Parts((mask(LEFT), mask(RIGHT)), (np.zeros(2), np.zeros(2)), mask())
+    height, width = SHAPE
+    found = amended(matte_of(images(10)), parts, ((0, 0, 219, height - 1), (400, 0, width - 1, height - 1))).fingers
+    assert not found[0][FACE].any() and found[0][LEFT].mean() > 0.95 and found[1][RIGHT].mean() > 0.95
+
+
 def test_a_face_in_a_light_of_its_own_stays_where_edges_enclose_it() -> None:
     """Its grey levels change like those of a background; then the part is what the rest of it encloses."""
     inside = np.s_[300:340, 150:190]

@@ -8,11 +8,13 @@ amend parts that edges have found, and what they give has to be measured along i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
 from gripmon.model.staying import Bits
-from gripmon.teach.fingers import Parts
+from gripmon.teach.fingers import Box, Parts, inside_box
 from gripmon.teach.matte import SMALLEST_PART, Matte
 from gripmon.teach.silhouette import CLEAR_NOISES
 
@@ -35,9 +37,13 @@ def stays_grey(matte: Matte) -> Bits:
     return np.asarray(cv2.medianBlur(stays.astype(np.uint8), _SMOOTHED) > 0)
 
 
-def amended(matte: Matte, parts: Parts) -> Parts:
-    """The fingers as what stays grey and touches them: each region that doesn't lie beside another one's."""
+def amended(matte: Matte, parts: Parts, within: Sequence[Box] = ()) -> Parts:
+    """The fingers as what stays grey and lies on them, each region on the one that has more of it; ``within``: only
+    there, if a person has said so.
+    """
     stays = stays_grey(matte) & ~parts.rest
+    if within:
+        stays = np.logical_or.reduce([inside_box(stays, box) for box in within])
     count, label = cv2.connectedComponents(stays.astype(np.uint8), connectivity=4)
     own = [np.bincount(label[part], minlength=count) for part in parts.fingers]
     fingers = []

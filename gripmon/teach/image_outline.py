@@ -81,7 +81,7 @@ def see_opening(
         return _seen(camera, matte, parts, len(images), step)
     except UnclearPartsError as unclear:
         try:
-            return _seen(camera, matte, amended(matte, parts), len(images), step)
+            return _seen(camera, matte, amended(matte, parts, within), len(images), step)
         except NoResultError:
             raise unclear from None
 
