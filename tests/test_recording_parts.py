@@ -7,11 +7,11 @@ from collections import Counter
 import numpy as np
 from support.recorded import HEIGHT_PX, WIDTH_PX
 
+from gripmon.model.pixels import to_8_bit
 from gripmon.model.records import State, Verdict
 from gripmon.model.shared_images import SharedImages
 from gripmon.record.columns import Palette
 from gripmon.record.overlay import _label_places
-from gripmon.record.recorder import to_8_bit
 
 
 def test_shared_images_keep_apart() -> None:

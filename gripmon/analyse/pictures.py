@@ -14,7 +14,6 @@ from gripmon.analyse.events import MOTIONS
 from gripmon.analyse.track import Track
 from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.records import AlertKind, Origin, Verdict
-from gripmon.record.recorder import to_8_bit
 from gripmon.record.recordings import Picture, Recording
 
 _SEEN = (
@@ -141,10 +140,10 @@ def _drawn(
     picture: Picture, used: bool, box: tuple[int, int, int, int], outline: Sequence[Points]
 ) -> ShownPicture | None:
     left, top, right, bottom = box
-    image = to_8_bit(picture.image)
-    if not image[top:bottom, left:right].size:
+    part = picture.image[top:bottom, left:right]
+    if not part.size:
         return None
-    canvas = Canvas(image[top:bottom, left:right], _WIDTH_PX / (right - left), (left, top), colours=True)
+    canvas = Canvas(part, _WIDTH_PX / (right - left), (left, top), colours=True)
     for strip in outline:
         canvas.line(strip, _BEFORE, 2)
     for strip in picture.predicted_edges:

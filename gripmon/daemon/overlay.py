@@ -7,7 +7,6 @@ from gripmon.model.camera import Camera
 from gripmon.model.canvas import Canvas, Colour
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, Image, Outlines, Snapshot
-from gripmon.record.recorder import to_8_bit
 from gripmon.teach.snapping import outlines_px
 
 _POINTS = 17  # per edge, which the lens bends
@@ -49,8 +48,7 @@ def overlay(
     """JPEG ``width_px`` wide: the outlines, green if the transform is valid, orange if suspect, and the corners, yellow
     if they were used, red if not; ``reference_px``: instead of these, white, where the edges are to be.
     """
-    shown = to_8_bit(image)
-    canvas = Canvas(shown, width_px / shown.shape[1])
+    canvas = Canvas(image, width_px / image.shape[1])
     for line_px in outlines:
         canvas.line(line_px, _OUTLINE.get(record.verdict.value, _LOST), 2)
     for line_px in reference_px or ():

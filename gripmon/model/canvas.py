@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.pixels import to_8_bit
 from gripmon.model.records import Array, Image
 
 Colour = tuple[int, int, int]
@@ -27,9 +28,7 @@ class Canvas:
         self, image: Image, zoom: float, origin_px: tuple[int, int] = (0, 0), *, colours: bool = False
     ) -> None:
         self.zoom, self._origin_px = zoom, np.array(origin_px)
-        if image.dtype != np.uint8:
-            top = 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype.str).max)
-            image = np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)
+        image = to_8_bit(image)
         if image.ndim == 3 and not colours:
             image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         way = cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_CUBIC

@@ -133,3 +133,13 @@ def _levels(image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
 def _filled(levels: NDArray[Any], bit_depth: int) -> NDArray[Any]:
     """``bit_depth``-bit grey levels as 16 bits: the high bits are repeated as the low ones, so that white is 65535."""
     return np.asarray((levels << (16 - bit_depth)) | (levels >> (2 * bit_depth - 16)), dtype=np.uint16)
+
+
+def to_8_bit(image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """uint16 by its upper byte, float from 0..1; for display only, so values out of range and NaN are clipped."""
+    if image.dtype == np.uint8:
+        return image.astype(np.uint8, copy=False)
+    if image.dtype == np.uint16:
+        return (image.astype(np.uint16, copy=False) >> 8).astype(np.uint8)
+    scaled = np.nan_to_num(image.astype(np.float32, copy=False) * np.float32(255.0), nan=0.0)
+    return np.clip(np.rint(scaled), 0.0, 255.0).astype(np.uint8)

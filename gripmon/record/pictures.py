@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.pixels import to_8_bit
 from gripmon.record.keeping import Moments
-from gripmon.record.recorder import Picture, RecordingSettings, Row, to_8_bit
+from gripmon.record.recorder import Picture, RecordingSettings, Row
 
 
 def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> Picture:

@@ -261,13 +261,3 @@ def pack_trace(trace: MeasurementTrace) -> TraceNote:
 def pairs(packed: bytes) -> NDArray[np.float32]:
     """(n, 2) from the bytes of a :class:`TraceNote`."""
     return np.frombuffer(packed, np.float32).reshape(-1, 2)
-
-
-def to_8_bit(image: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """uint16 by its upper byte, float from 0..1; for display only, so values out of range and NaN are clipped."""
-    if image.dtype == np.uint8:
-        return image.astype(np.uint8, copy=False)
-    if image.dtype == np.uint16:
-        return (image.astype(np.uint16, copy=False) >> 8).astype(np.uint8)
-    scaled = np.nan_to_num(image.astype(np.float32, copy=False) * np.float32(255.0), nan=0.0)
-    return np.clip(np.rint(scaled), 0.0, 255.0).astype(np.uint8)
