@@ -70,11 +70,14 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
 
 
+@pytest.mark.parametrize("pad_px", [30, 80])
 @pytest.mark.parametrize("texture_dn", [0.0, 10.0])
-def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn: float) -> None:
-    """Beyond one half of an edge there is a plain pad, whose light changes; plain walls as well may be one."""
+def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn: float, pad_px: int) -> None:
+    """Beyond one half of an edge there is a plain pad, whose light changes, or a whole finger, of which only a face was
+    found; plain walls as well may be one.
+    """
     rng, images = np.random.default_rng(2), []
-    pad = np.s_[60:120, 100:130]
+    pad = np.s_[60:120, 100 : 100 + pad_px]
     for _ in range(8):
         blots = cv2.GaussianBlur(rng.normal(size=(200, 300)), (0, 0), 1.5)
         image = 120.0 + texture_dn / blots.std() * blots + rng.normal(0.0, 4.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtri, ndtri, stdtrit
 
 from gripmon.model.records import Array
-from gripmon.model.staying import CELL_PX, Bits, Plane
+from gripmon.model.staying import CELL_PX, LEAST_CHANGING, Bits, Plane
 from gripmon.teach.silhouette import NARROW_PX, STEP_PX, WIDE_PX, Stations, across
 
 WITHIN_PX = 1.0
@@ -29,15 +29,17 @@ _FAR_PX = 20.0
 
 @dataclass(frozen=True)
 class Background:
-    """What changes over the images (h, w): standard deviation of grey levels, ``scatter``, and where edges come and go,
-    ``changing``.  ``least_scatter``, ``least_changing``: what all but a hundredth of the background's places, squares
-    of :data:`~gripmon.model.staying.CELL_PX`, have of them in the mean.
+    """What changes over ``count`` images (h, w) ``outside`` of what stays: standard deviation of grey levels,
+    ``scatter``, and where edges come and go, ``changing``; ``places`` (2, h, w), both in the mean over squares of
+    :data:`~gripmon.model.staying.CELL_PX`; ``far`` from what stays.
     """
 
+    count: int
     scatter: Plane
     changing: Plane
-    least_scatter: float
-    least_changing: float
+    places: Plane
+    outside: Bits
+    far: Bits
 
     @classmethod
     def of(cls, images: NDArray[np.float32], still: Bits, changing: Bits) -> Background:
@@ -45,21 +47,34 @@ class Background:
         away = cv2.distanceTransform((~still).astype(np.uint8), cv2.DIST_L2, 5)
         scatter = np.asarray(images.std(axis=0), np.float32)
         comes = np.asarray(cv2.resize(changing.astype(np.float32), images.shape[:0:-1]), np.float32)
-        return cls(scatter, comes, *(_usual_least(plane, away > _FAR_PX) for plane in (scatter, comes)))
+        places = np.stack([cv2.blur(plane, (CELL_PX, CELL_PX)) for plane in (scatter, comes)])
+        return cls(len(images), scatter, comes, places, ~still, away > _FAR_PX)
 
     def begins(self, stations: Stations) -> bool:
         """Whether grey levels at 4.5 to 8 px beyond these stations change as a background's, or edges come and go: less
-        of both than almost anywhere in the background is a tip or a pad of whatever grey.  Where the background is
-        plain, nothing shows it.
+        of both than almost anywhere in the background is a tip or a pad of whatever grey, or the finger itself, of
+        which only a face was found: it isn't compared with what joins it.  Where most of the background is as plain,
+        nothing shows it.
         """
         s = np.arange(4.5, WIDE_PX + 0.25, STEP_PX)
         scatter, changing = across(np.stack([self.scatter, self.changing]), stations, s).mean(axis=(1, 2))
-        return bool(scatter >= self.least_scatter or changing >= self.least_changing)
+        others = self.far & ~self._joined(stations, s, scatter, changing)
+        if np.count_nonzero(others) < 0.5 * np.count_nonzero(self.far):
+            return True
+        least_scatter, least_changing = np.quantile(self.places[:, others], BY_CHANCE, axis=1)
+        return bool(scatter >= least_scatter or changing >= least_changing)
 
-
-def _usual_least(plane: Plane, far: Bits) -> float:
-    places = cv2.blur(plane, (CELL_PX, CELL_PX))[far]
-    return float(np.quantile(places, BY_CHANCE)) if len(places) else 0.0
+    def _joined(self, stations: Stations, s: Array, scatter: float, changing: float) -> Bits:
+        """What joins the places at distances ``s`` (m,) beyond these stations and doesn't surely change by more than
+        they do (Fisher's F of as many images).
+        """
+        more = float(fdtri(self.count - 1, self.count - 1, 1.0 - NOT_SURE)) ** 0.5
+        calm = (self.places[0] <= more * scatter) & (self.places[1] <= more * max(changing, LEAST_CHANGING))
+        _, label = cv2.connectedComponents((calm & self.outside).astype(np.uint8), connectivity=4)
+        beyond_px = stations.uv_px[:, None] + stations.normal[:, None] * s[:, None]
+        column, row = np.clip(np.rint(beyond_px).astype(int).reshape(-1, 2).T, 0, [[k - 1] for k in label.shape[::-1]])
+        own = np.unique(label[row, column])
+        return np.isin(label, own[own > 0])
 
 
 def is_outermost(images: NDArray[np.float32], stations: Stations, blur_px: float) -> bool:

@@ -15,7 +15,6 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.model.staying import Bits, Plane
 from gripmon.teach.beyond import Background
-from gripmon.teach.constant_grey import amended
 from gripmon.teach.fingers import SHORTEST_OUTLINE_PX, Box, Parts, UnclearPartsError, find_fingers
 from gripmon.teach.image_borders import WELL_SEEN, Border, borders_of
 from gripmon.teach.inner_edges import InnerEdge, find_inner_edges
@@ -77,17 +76,7 @@ def see_opening(
     """
     matte = find_matte(images, least_noise, step)
     parts = find_fingers(matte.still, matte.edges, fingers, within)
-    try:
-        return _seen(camera, matte, parts, len(images), step)
-    except UnclearPartsError as unclear:
-        try:
-            return _seen(camera, matte, amended(matte, parts, within), len(images), step)
-        except NoResultError:
-            raise unclear from None
-
-
-def _seen(camera: Camera, matte: Matte, parts: Parts, count: int, step: Callable[[], None]) -> OpeningSeen:
-    """What ``count`` images show of the outlines of these parts."""
+    count = len(images)
     left_out = dict(matte.left_out)
     contours = [(part, contour) for part in parts.fingers for contour in trace(part, int(SHORTEST_OUTLINE_PX))]
     for turn in range(_TURNS):
