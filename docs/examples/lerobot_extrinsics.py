@@ -79,6 +79,8 @@ def _one_each(values: np.ndarray) -> np.ndarray:
 
 def main(root: Path, stretches: Path, copy: Path, below: str = "") -> None:
     """Make the copy."""
+    if copy.exists():
+        raise SystemExit(f"{copy} is there already; a folder that isn't")
     dataset = LeRobotDataset("local/original", root=root)
     frames = dataset.hf_dataset.with_format("numpy").select_columns(["episode_index", "timestamp"])[:]
     added = columns(stretches, np.ravel(frames["episode_index"]), np.ravel(frames["timestamp"]), below)
