@@ -47,7 +47,7 @@ class Background:
         away = cv2.distanceTransform((~still).astype(np.uint8), cv2.DIST_L2, 5)
         scatter = np.asarray(images.std(axis=0), np.float32)
         comes = np.asarray(cv2.resize(changing.astype(np.float32), images.shape[:0:-1]), np.float32)
-        places = np.stack([cv2.blur(plane, (CELL_PX, CELL_PX)) for plane in (scatter, comes)])
+        places = np.asarray([cv2.blur(plane, (CELL_PX, CELL_PX)) for plane in (scatter, comes)], np.float32)
         return cls(len(images), scatter, comes, places, ~still, away > _FAR_PX)
 
     def begins(self, stations: Stations) -> bool:
