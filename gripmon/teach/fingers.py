@@ -90,9 +90,9 @@ def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Se
     """
     strength = np.asarray(cv2.resize(edges.strength, still.shape[::-1]), np.float32)
     if len(within) > 1:
-        each = [_candidates(inside_box(still, box), strength, edges.limit)[:1] for box in within]
+        each = [_candidates(_inside_box(still, box), strength, edges.limit)[:1] for box in within]
         return _chosen([own for found in each for own in found], still, len(within))
-    found = _candidates(inside_box(still, within[0]) if within else still, strength, edges.limit)
+    found = _candidates(_inside_box(still, within[0]) if within else still, strength, edges.limit)
     alike = [own for own in found if own[2] >= ALIKE_OUTLINES * found[0][2]]
     if count != 1 and len(alike) == 1 and len(found) > 1:  # the largest may be a cable
         raise UnclearPartsError(
@@ -105,8 +105,7 @@ def find_fingers(still: Bits, edges: Edges, count: int | None = None, within: Se
     return _chosen(alike, still, count or 2)
 
 
-def inside_box(still: Bits, box: Box) -> Bits:
-    """What of a mask (h, w) lies in a box."""
+def _inside_box(still: Bits, box: Box) -> Bits:
     left, top, right, bottom = box
     out = np.zeros_like(still)
     out[top : bottom + 1, left : right + 1] = still[top : bottom + 1, left : right + 1]
