@@ -179,8 +179,7 @@ def _episodes_of_3(path: str) -> list[dict[str, Any]]:
             # The table has hundreds of further columns of statistics.
             places = ("data/", "video")
             wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c.startswith(places)]
-            # Not in Arrow's threads: one that still holds the Python file while the process ends can abort it.
-            rows += table.read(columns=wanted, use_threads=False).to_pylist()
+            rows += table.read(columns=wanted).to_pylist()
     return rows
 
 
