@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import cv2
@@ -380,6 +381,24 @@ def test_from_a_store_of_objects(tmp_path: Path):
     memory.put(str(tmp_path / "a.mcap"), "/episodes/a.mcap")
     assert_as_written(frames_of(LeRobotSettings(path="memory://episodes/set", opening=GRIPPER)), shots(4), lossy_dn=1.5)
     assert_as_written(frames_of(BagSettings(path="memory://episodes/a.mcap", opening=FINGERS)), shots(4))
+
+
+def test_tables_are_read_in_the_callers_thread_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A thread of Arrow's that still holds a Python file when the process ends aborts it (apache/arrow#34314)."""
+    import fsspec
+    from fsspec.implementations.memory import MemoryFile
+
+    write_lerobot(tmp_path / "set", [shots(4, 10.0), shots(3, 10.0, 4)], fps=10)
+    fsspec.filesystem("memory").put(str(tmp_path / "set"), "/watched/set", recursive=True)
+    threads = set()
+
+    def read(file: MemoryFile, size: int = -1) -> bytes:
+        threads.add(threading.get_ident())
+        return super(MemoryFile, file).read(size)
+
+    monkeypatch.setattr(MemoryFile, "read", read, raising=False)
+    open_source(LeRobotSettings(path="memory://watched/set", episode=1, opening=GRIPPER)).close()
+    assert threads == {threading.get_ident()}
 
 
 def test_from_s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

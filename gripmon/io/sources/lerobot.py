@@ -13,7 +13,7 @@ import re
 import string
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import IO, Annotated, Any
 
 import msgspec
 import numpy as np
@@ -174,13 +174,22 @@ def _episodes_of_3(path: str) -> list[dict[str, Any]]:
     system, inside = file_system(path)
     rows: list[dict[str, Any]] = []
     for name in filter(system.isfile, sorted(system.glob(joined(inside, "meta/episodes/*/*.parquet")))):
-        with system.open(name, "rb") as file:
-            table = parquet.ParquetFile(file)
-            # The table has hundreds of further columns of statistics.
-            places = ("data/", "video")
-            wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c.startswith(places)]
-            rows += table.read(columns=wanted).to_pylist()
+        table = parquet.ParquetFile(_for_arrow(system.open(name, "rb")))
+        # The table has hundreds of further columns of statistics.
+        places = ("data/", "video")
+        wanted = [c for c in table.schema_arrow.names if c in ("episode_index", "length") or c.startswith(places)]
+        rows += table.read(columns=wanted).to_pylist()
     return rows
+
+
+def _for_arrow(opened_file: IO[bytes]) -> Any:
+    """What is in a file, which is closed.  Arrow reads a Python file in threads of its own, and one that lets go of it
+    while the process ends aborts this (https://github.com/apache/arrow/issues/34314).
+    """
+    from pyarrow import BufferReader
+
+    with opened_file:
+        return BufferReader(opened_file.read())
 
 
 class LeRobotSource(Stored):
@@ -230,17 +239,20 @@ class LeRobotSource(Stored):
             named = ", ".join(dataset.joints) or "none"
             raise SourceError(f"opening.joints: {dataset.path} has no {', '.join(missing)}; of its {_STATE}: {named}")
         path = dataset.table(self._episode)
-        with opened(path) as file:
-            try:
-                table = parquet.read_table(file, columns=columns, filters=[("episode_index", "==", self._episode)])
-                time_s = np.array(table["timestamp"].to_pylist(), float).reshape(-1)
-                openings_m = None
-                if opening is not None:
-                    state = np.array(table[_STATE].to_pylist(), float).reshape(len(time_s), -1)
-                    at = [dataset.joints.index(name) for name in opening.joints]
-                    openings_m = opening.offset_m + opening.scale * state[:, at].sum(axis=1)
-            except Exception as error:  # noqa: BLE001  a stranger's table, and Arrow's own errors
-                raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole table") from None
+        try:
+            table = parquet.read_table(
+                _for_arrow(opened(path)), columns=columns, filters=[("episode_index", "==", self._episode)],
+            )  # fmt: skip
+            time_s = np.array(table["timestamp"].to_pylist(), float).reshape(-1)
+            openings_m = None
+            if opening is not None:
+                state = np.array(table[_STATE].to_pylist(), float).reshape(len(time_s), -1)
+                at = [dataset.joints.index(name) for name in opening.joints]
+                openings_m = opening.offset_m + opening.scale * state[:, at].sum(axis=1)
+        except SourceError:
+            raise
+        except Exception as error:  # noqa: BLE001  a stranger's table, and Arrow's own errors
+            raise SourceError(f"path: {path} can't be read ({one_line(error):.200}); a whole table") from None
         if not len(time_s) or not (np.diff(time_s) > 0.0).all() or not 0.0 <= time_s[0] <= time_s[-1] < _LONGEST_S:
             wrong = f"episode {self._episode} has no rows, or time stamps that don't rise"
             raise SourceError(f"path: {path}: {wrong}; seconds from its beginning")
