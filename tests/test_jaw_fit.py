@@ -17,10 +17,10 @@ NONE = np.zeros(0)
 
 
 class Fit:
-    """Explains the outlines to a chi-squared, with a share of them that agrees."""
+    """Explains the outlines to a chi-squared, with a share of them that agrees, and another that is placed."""
 
-    def __init__(self, chi2: float, agreeing: float):
-        self.chi2, self.agreeing = chi2, agreeing
+    def __init__(self, chi2: float, agreeing: float, placed_share: float = 1.0):
+        self.chi2, self.agreeing, self.placed_share = chi2, agreeing, placed_share
 
     def solve(self, common: Any) -> _Solved:
         if not np.isfinite(self.chi2):
@@ -36,10 +36,12 @@ class Fit:
         ((19.3, 0.79), (18.3, 0.94), 0, 0.94),  # the outlines themselves are off: no depths explain them better
         ((np.inf, 0.0), (59.0, 0.86), 1, 0.86),
         ((160.0, 0.43), (np.inf, 0.0), 0, 0.43),
+        ((4.0, 0.97, 0.3), (60.0, 0.9), 1, 0.9),  # of fingers with pads perspective places the pads alone
+        ((4.0, 0.97, 0.3), (60.0, 0.7), 0, 0.97),  # what it leaves out doesn't move with the tips
     ],
 )
 def test_the_motion_overrules_perspective_where_the_outlines_do(
-    perspective: tuple[float, float], motion: tuple[float, float], taken: int, agreeing: float
+    perspective: tuple[float, ...], motion: tuple[float, ...], taken: int, agreeing: float
 ) -> None:
     fits: list[Any] = [Fit(*perspective), Fit(*motion)]
     fit, best = _best_of(fits, loose=False)

@@ -53,7 +53,9 @@ _FINER = ((True, 1.0), (True, 0.5), (False, 0.3), (False, LEAST_SCATTER_PX))
 CONTRADICTS = 3.0
 """Scatters by which a piece contradicts the rest."""
 AGREEING = 0.8
-"""Least part of the outlines in view that agrees: of two fingers with four edges each, one or two may be others."""
+"""Least part of the outlines in view that agrees, and of what moves with the tips that perspective places: of two
+fingers with four edges each, one or two may be others.
+"""
 _SAME_WAY = math.cos(math.radians(30.0))
 _PER_PIECE = 2.0
 _STEPS = 5
@@ -94,8 +96,9 @@ def fit_motion(
 
 
 def _best_of(fits: Sequence[_Fit], *, loose: bool) -> tuple[_Fit, _Solved]:
-    """The first of the fits, unless the outlines contradict it, as they contradict what perspective says of a taper's
-    sides, which aren't parallel, and another one explains them clearly better.  Where it doesn't, what disagrees are
+    """The first of the fits, which takes the depths from perspective, unless the outlines contradict it, as they
+    contradict what perspective says of a taper's sides, which aren't parallel, and another one explains them clearly
+    better; or it leaves out much of what moves with the tips, which another one places.  Otherwise what disagrees are
     the outlines, and the first agrees as far as the other one.
     """
     found: list[tuple[_Fit, _Solved]] = []
@@ -110,11 +113,14 @@ def _best_of(fits: Sequence[_Fit], *, loose: bool) -> tuple[_Fit, _Solved]:
         except Unfit as unfit:
             why = unfit
             continue
-        if found and found[0][1].chi2 - best.chi2 <= MORE_CHI2:
-            found = [(found[0][0], replace(found[0][1], agreeing=max(found[0][1].agreeing, best.agreeing)))]
-            continue
+        if found:
+            first, before = found[0]
+            more = first.placed_share < AGREEING <= best.agreeing
+            if not more and before.chi2 - best.chi2 <= MORE_CHI2:
+                found = [(first, replace(before, agreeing=max(before.agreeing, best.agreeing)))]
+                continue
         found = [(fit, best)]
-        if best.agreeing >= AGREEING:
+        if min(fit.placed_share, best.agreeing) >= AGREEING:
             break
     if not found:
         raise why

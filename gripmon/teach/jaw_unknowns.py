@@ -104,7 +104,10 @@ class Jaws:
         foremost = [f.xy[(f.xy @ f.outwards).argmax()] for f in self.fingers]
         if len(foremost) == 2:
             way = way * np.sign(float(way @ (foremost[1] - foremost[0])))
-        self.kept = tuple(_shown(f, way) for f in self.fingers) if self.placed is None else self.placed.kept
+        shown = tuple(_shown(f, way) for f in self.fingers)
+        self.kept = shown if self.placed is None else self.placed.kept
+        self.placed_share = _length(self.fingers, self.kept) / _length(self.fingers, shown)
+        """Of the outlines whose depth the motion shows, the part that is placed."""
         self._stations()
         self.tips = [first + own for first, own in zip(self.first, contact(self.fingers, way)[0], strict=False)]
         self.sign = np.sign(apart @ way)
@@ -226,6 +229,11 @@ class Jaws:
             between, sigma = (last - first)[None], BESIDE_ROUGHLY
         between /= np.linalg.norm(between, axis=1)[:, None]
         return np.asarray(np.cross(between, way).ravel() / sigma)
+
+
+def _length(fingers: Sequence[Outline], pieces: Sequence[Sequence[tuple[int, int]]]) -> float:
+    """Of some pieces of each finger's outline, in the image."""
+    return sum(float(np.linalg.norm(f.xy[a] - f.xy[b])) for f, own in zip(fingers, pieces, strict=True) for a, b in own)
 
 
 def _shown(finger: Outline, way: Array) -> tuple[tuple[int, int], ...]:
