@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,7 +23,7 @@ from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.fingers import UnclearPartsError
-from gripmon.teach.from_images import GripperFromImages, _groups, gripper_from_images
+from gripmon.teach.from_images import GripperFromImages, _groups, _see_openings, gripper_from_images
 from gripmon.teach.matte import grey_levels, image_sets
 
 DISTANCE = (0.115, 5e-5)
@@ -126,6 +127,18 @@ def test_tapered_fingers_are_tracked_before_other_backgrounds() -> None:
     assert len(errors) >= 0.75 * (frames - 1)
     assert np.quantile(np.abs(np.array(errors)[:, :2]), 0.95) < 8e-5
     assert np.quantile(np.abs(np.array(errors)[:, 2]), 0.95) < 1.5e-4
+
+
+def test_a_refusal_names_an_image_of_the_opening_that_it_is_about() -> None:
+    def see(images: Any) -> Any:
+        if images[0].min() > 0:
+            raise UnclearPartsError("unclear", [], np.zeros((4, 4), bool))
+        return SimpleNamespace(left_out={})
+
+    grey, groups = [np.full((4, 4), k, np.float32) for k in (0, 0, 1, 1)], {0.03: [0, 1], 0.02: [2, 3]}
+    with pytest.raises(UnclearPartsError, match="from c to d; of them unclear") as caught:
+        _see_openings(see, grey, {opening: own * 3 for opening, own in groups.items()}, "abcd", [], {}, "")
+    assert caught.value.image == 2
 
 
 def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:

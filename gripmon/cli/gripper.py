@@ -216,7 +216,8 @@ def from_images(arguments: Arguments) -> None:
             response=arguments.response, progress=progress_bar,
         )  # fmt: skip
     except UnclearPartsError as unclear:
-        arguments.save("picture", unclear.picture(next(images_of_one_camera(images))[1]))
+        _, shown = next(images_of_one_camera(images[unclear.image :]))
+        arguments.save("picture", unclear.picture(shown))
         raise
     save(arguments, found, provenance, videos=taken.notes)
 

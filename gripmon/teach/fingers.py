@@ -51,12 +51,12 @@ class Parts:
 
 class UnclearPartsError(NoResultError):
     """Which parts are the fingers isn't clear.  ``parts``: masks (h, w) of those that may be; ``unseen_px``: points
-    (k, 2) of their outlines that don't show.
+    (k, 2) of their outlines that don't show; ``image``: number of the first image that shows them there.
     """
 
     def __init__(self, text: str, parts: list[Bits], still: Bits, unseen_px: Sequence[Array] = ()):
         super().__init__(text)
-        self.parts, self.still, self.unseen_px = parts, still, unseen_px
+        self.parts, self.still, self.unseen_px, self.image = parts, still, unseen_px, 0
 
     def picture(self, shown: Image) -> Image:
         """The image (h, w[, 3]) with what stays (blue), what may be a finger (green, numbered), and what of its outline

@@ -194,6 +194,8 @@ def _see_openings(
         try:
             seen[opening] = see([grey[k] for k in own])
         except NoResultError as refused:
+            if isinstance(refused, UnclearPartsError):
+                refused.image = own[0]
             if hint:
                 refused.args = (f"{refused}; {hint}",)
             if len(groups) > 1:
