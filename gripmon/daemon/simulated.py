@@ -156,11 +156,13 @@ def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
 
 def _config_text(config: Config, scenario: Scenario, seed: int) -> str:
     """A commented configuration for the sequence, like the hand-written ones."""
-    reported = config.gripper.has_jaw and scenario.jaw.reported
+    reported, known = config.gripper.has_jaw and scenario.jaw.reported, config.settings.reference
+    sigmas = {"position_sigma_m": known.position_sigma_m, "rotation_sigma_rad": known.rotation_sigma_rad}
     return text_of(
         f"gripmon simulate {scenario.name} --seed {seed}", robot="simulated", camera_name="wrist",
-        camera=config.settings.camera, gripper="gripper.yaml", reference=reference_section(config.reference.cam_T_grip),
-        source=FolderSettings(path="."), jaw=JawSettings(source="frames" if reported else "fixed"),
+        camera=config.settings.camera, gripper="gripper.yaml",
+        reference=reference_section(config.reference.cam_T_grip, **sigmas), source=FolderSettings(path="."),
+        jaw=JawSettings(source="frames" if reported else "fixed"),
     )  # fmt: skip
 
 
