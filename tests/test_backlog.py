@@ -45,14 +45,6 @@ def test_what_is_not_urgent_holds_up_nothing_that_is():
     assert list(backlog.results(1.5 + RESULT_AFTER_S)) == ["confirmed", "without a time", "urgent"]
 
 
-def test_what_fails_is_a_result_and_what_follows_is_done():
-    backlog: Backlog[int] = Backlog()
-    backlog.add(lambda: 1 // 0, 0.0)
-    backlog.add(lambda: 7)
-    error, seven = backlog.results(RESULT_AFTER_S)
-    assert isinstance(error, ZeroDivisionError) and seven == 7
-
-
 def test_who_needs_a_result_waits_for_the_thread_that_makes_it():
     backlog: Backlog[str] = Backlog()
     began, may_end = threading.Event(), threading.Event()

@@ -182,20 +182,6 @@ def test_images_of_two_sizes_are_refused(folder: Path, tmp_path: Path, capsys: p
     assert "has 240 x 180 px and" in capsys.readouterr().err
 
 
-def test_blurred_and_parallel_images_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    out = tmp_path / "c.yaml"
-    blurred = render(LENS, shown(0), BOARD, Look(supersampling=1, blur_px=8.0))
-    cv2.imwrite(str(tmp_path / "blurred.png"), blurred)
-    assert calibrate(str(tmp_path / "blurred.png"), "--target", TEXT, "--out", str(out)) == 3
-    assert "blurred: its sharpest edges" in capsys.readouterr().err
-    for k in range(4):
-        T = pose(BOARD, (0.01 * k - 0.02, 0.0, 0.25 + 0.02 * k), (0.0, 0.0), 0.3 * k)
-        cv2.imwrite(str(tmp_path / f"flat{k}.png"), render(LENS, T, BOARD, LOOK, seed=k))
-    assert calibrate(*[str(tmp_path / f"flat{k}.png") for k in range(4)], "--target", TEXT, "--out", str(out)) == 3
-    assert "more tilted against each other" in capsys.readouterr().err
-    assert not out.exists()
-
-
 def test_a_target_that_is_described_too_large_is_doubted(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

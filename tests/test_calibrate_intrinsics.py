@@ -199,13 +199,6 @@ def test_views_that_determine_nothing_end_after_a_bounded_effort(model: str, mon
     assert calibrate(seen(BROWN, poses(rng, 9), rng), "brown_conrady").rms_px < 0.15
 
 
-def test_views_by_two_cameras_are_refused():
-    rng = np.random.default_rng(14)
-    views = [*seen(BROWN, poses(rng, 5), rng), *seen(CAMERAS["fisheye"], poses(rng, 5, 0.12), rng)]
-    with pytest.raises(CalibrationError, match=r"contradict the other images|explains the views"):
-        calibrate(views, "brown_conrady")
-
-
 def test_views_of_two_sizes_are_refused():
     rng = np.random.default_rng(15)
     views = seen(BROWN, poses(rng, 4), rng)

@@ -240,15 +240,6 @@ def test_another_target_of_the_same_pattern_is_taken_where_it_is_confirmed(here:
     assert "--other-target" in found.provenance.command
 
 
-def test_another_jaw_opening_is_warned_of(here: Path, capsys: pytest.CaptureFixture[str]):
-    options = ["--camera", "camera.yaml", "--target", TARGET, "--gripper", "gripper.yaml", "--jaw-opening", "0.0345"]
-    assert plane("p0.png", *options, "--corners", "rough.yaml", "--out", "he.yaml") == 0
-    found, said = hand_eye(here / "he.yaml"), capsys.readouterr().err
-    assert "the corners don't fit the gripper file" in found.warnings[0] and f"warning: {found.warnings[0]}" in said
-    error = perturbation_between(from_record(found.cam_T_grip), TRUE)
-    assert error @ np.linalg.solve(np.reshape(found.covariance, (6, 6)), error) < chi2.ppf(0.999, 6)
-
-
 def test_nothing_is_replaced_without_force(here: Path, capsys: pytest.CaptureFixture[str]):
     (here / "he.yaml").write_text("mine")
     assert plane("p0.png", *KNOWN, "--corners", "rough.yaml", "--out", "he.yaml") == 2

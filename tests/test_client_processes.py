@@ -15,7 +15,7 @@ from support.loopback import ask, frame_record, free_endpoint, plain_session, wa
 from support.remote_monitor import remote_monitor, router
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
-from gripmon.model.records import Verdict, to_json
+from gripmon.model.records import to_json
 
 PATIENT = Policy(max_age_s=3600.0)
 """Nothing grows too old on a slow machine."""
@@ -36,17 +36,6 @@ def refused(client: TransformClient, why: Unusable) -> Reading:
     """The client's reading once it is refused, and for this reason."""
     wait_until(lambda: client.latest().why is why, f"the reading to be refused: {why}")
     return client.latest()
-
-
-def test_a_killed_monitor_is_known_to_be_gone_whatever_age_is_allowed(endpoint: str):
-    with TransformClient("arm", connect=[endpoint], policy=PATIENT) as client:
-        with remote_monitor(listen=[endpoint]) as monitor:
-            before = usable(client)
-            monitor.send_signal(signal.SIGKILL)
-            gone = refused(client, Unusable.GONE)
-        assert gone.reason == "the monitor is gone" and not gone.usable
-        assert gone.verdict is Verdict.UNKNOWN and gone.transform is None and gone.covariance is None
-        assert gone.seq >= before.seq and gone.same_revision_as(before)
 
 
 def test_a_stopped_monitors_transform_is_stale_and_usable_again(endpoint: str):

@@ -11,8 +11,6 @@ import numpy as np
 import psutil
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
 from support.rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws
 
 from gripmon.io.publish.commands import _name, _request
@@ -110,15 +108,3 @@ def test_6000_commands():
             assert isinstance(request.argument, str) and len(request.argument) < 4096
     assert refused > 4_000
     assert _request(zenoh.ZBytes(b'{"argument": "x"}')) == CommandRequest(argument="x")
-
-
-@given(st.binary(max_size=300), st.text(max_size=20), st.none() | st.binary(max_size=100))
-def test_whatever_comes_is_a_frame_or_refused(payload: bytes, encoding: str, attachment: bytes | None):
-    refusals(PayloadDecoder("auto", SIZE_PX), [Rubbish(payload, encoding, attachment)])
-
-
-@given(st.recursive(st.none() | st.booleans() | st.floats() | st.integers() | st.text(), st.lists, max_leaves=5))
-def test_an_attachment_of_any_content_is_a_note_or_refused(value: object):
-    for name in ("stamp_ns", "jaw_opening_m", "width", "height", "encoding", "step"):
-        note = json.dumps(good_note(**{name: value})).encode()
-        refusals(PayloadDecoder("auto", SIZE_PX), [Rubbish(image().tobytes(), attachment=note)])

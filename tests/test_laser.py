@@ -1,4 +1,4 @@
-"""The laser-pointer method: its geometry, each step of its closed form, degenerate set-ups by name."""
+"""The laser-pointer method: its geometry, its closed form from end to end, degenerate set-ups by name."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from support.laser_scenes import assert_same, laser_printed, numeric, paper_setu
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser import closed_form
-from gripmon.laser.plane_search import find_plane
 from gripmon.laser.refinement import SpotProblem, refine
 from gripmon.laser.setup import (
     LaserSetup,
-    basis,
     beams,
     in_camera,
     nearest_points,
-    origin_axes,
     spots_in_camera,
     spots_on_plane,
     spots_on_rays,
@@ -96,33 +93,7 @@ def test_a_setup_as_the_camera_has_it_is_the_same_in_the_base():
     assert np.abs(spots @ data.truth.normal_cam - data.truth.distance_cam_m).max() < 1e-12
 
 
-@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.1, 0.2, 0.97)])
-def test_a_laser_along_an_axis_has_its_point_in_the_plane_across(direction):
-    unit = np.array(direction) / np.linalg.norm(direction)
-    axes = origin_axes(unit)
-    assert int(np.argmax(np.abs(unit))) not in axes
-    a, b = basis(unit)
-    assert np.allclose(np.cross(a, b), unit)
-
-
 # ---- the closed form as printed, step by step
-
-
-def true_orientations(data):
-    """Orientations with matrices that come from the truth, at scales of their own."""
-    out, scales, rng = [], [], np.random.default_rng(5)
-    setup = data.truth
-    for members in closed_form.orientation_groups(data.base_T_ee):
-        centre = data.base_T_ee[members, :3, 3].mean(axis=0)
-        base_R_ee = data.base_T_ee[members[0], :3, :3]
-        pose = make_transform(base_R_ee, centre)[None]
-        spot = in_camera(setup, spots_on_plane(setup, pose))[0]
-        u = setup.cam_T_base[:3, :3] @ beams(setup, pose)[1][0]
-        motion = (np.eye(3) - np.outer(u, setup.normal_cam) / (u @ setup.normal_cam)) @ setup.cam_T_base[:3, :3]
-        scales.append(rng.uniform(0.3, 3.0))
-        matrix = np.concatenate([motion, spot[:, None]], axis=1) / scales[-1]
-        out.append(closed_form.Orientation(members, base_R_ee, centre, matrix))
-    return out, np.array(scales)
 
 
 def test_orientations_are_found_from_the_poses():
@@ -132,58 +103,6 @@ def test_orientations_are_found_from_the_poses():
     assert sorted(len(g) for g in groups) == [10] * 6
     for group in groups:
         assert len(set(data.group[shuffled[group]])) == 1
-
-
-def test_step_2_the_matrix_of_an_orientation():
-    data = scene()
-    for orientation, _ in zip(*true_orientations(data), strict=True):
-        shifts = data.base_T_ee[orientation.members, :3, 3] - orientation.centre_m
-        found = laser_printed.spot_matrix(ideal(data)[orientation.members], shifts)
-        truth = orientation.matrix / np.linalg.norm(orientation.matrix[:, 3])
-        assert np.abs(found - truth).max() < 1e-9 * np.abs(truth).max()
-
-
-def test_step_3_the_plane_normal():
-    data = scene()
-    orientations, _ = true_orientations(data)
-    assert np.abs(laser_printed.plane_normal([o.matrix for o in orientations]) - data.truth.normal_cam).max() < 1e-9
-
-
-def test_step_4_one_of_two_beams_is_the_true_one_and_brings_the_rotation():
-    data = scene()
-    orientations, _ = true_orientations(data)
-    for orientation in orientations:
-        u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
-        pair = laser_printed.beam_candidates(orientation.matrix, data.truth.normal_cam)
-        right = min(pair, key=lambda c: float(np.abs(np.cross(c.beam_cam, u)).max()))
-        assert np.abs(np.cross(right.beam_cam, u)).max() < 1e-9
-        assert np.abs(right.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    chosen = laser_printed.consistent_beams(
-        [laser_printed.beam_candidates(o.matrix, data.truth.normal_cam) for o in orientations]
-    )
-    assert all(np.abs(c.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9 for c in chosen)
-
-
-def test_step_6_the_beam_in_the_hand():
-    data = scene()
-    cam_R_base = data.truth.cam_T_base[:3, :3]
-    rotations = [o.base_R_ee for o in true_orientations(data)[0]]
-    beams = [cam_R_base @ R @ data.truth.direction_ee for R in rotations]
-    found = closed_form.beam_in_hand(beams, rotations, cam_R_base)
-    assert np.abs(found - data.truth.direction_ee).max() < 1e-9
-
-
-def test_steps_7_and_8_positions_scales_and_the_plane_distance():
-    data = scene()
-    orientations, scales = true_orientations(data)
-    point, shift, found = closed_form.positions(
-        orientations, data.base_T_ee, data.truth.cam_T_base[:3, :3], data.truth.direction_ee
-    )
-    assert np.abs(point - data.truth.point_ee_m).max() < 1e-9  # the paper's point lies in the y-z plane, too
-    assert np.abs(shift - data.truth.cam_T_base[:3, 3]).max() < 1e-9
-    assert np.abs(found - scales).max() < 1e-9
-    distance = laser_printed.plane_distance(orientations, scales, data.truth.normal_cam, data.base_T_ee)
-    assert abs(distance - data.truth.distance_cam_m) < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -206,20 +125,6 @@ def test_beams_along_other_axes_choose_another_origin_plane():
 
 
 # ---- the better closed form
-
-
-def test_the_common_planes_start_is_exact():
-    data = scene(2)
-    orientations, _ = true_orientations(data)
-    shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
-    normal, matrices = find_plane(ideal(data), shifts, [o.members for o in orientations])
-    assert np.abs(normal - data.truth.normal_cam).max() < 1e-9
-    cam_R_base, beams_cam, distance_m = closed_form.rotation_and_beams([m[:, :3] for m in matrices], normal)
-    assert np.abs(cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    assert abs(distance_m - data.truth.distance_cam_m) < 1e-9
-    for beam, orientation in zip(beams_cam, orientations, strict=True):
-        u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
-        assert np.abs(np.cross(beam, u)).max() < 1e-9
 
 
 def test_with_noise_the_common_plane_is_far_better_than_the_printed_closed_form():

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.loopback import WAIT_S, free_endpoint, plain_session, wait_until
+from support.loopback import free_endpoint, plain_session, wait_until
 from support.router_process import RouterProcess, plain_config, running
 
-from gripmon.client import Client
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.io.wire.link import is_at
-
-HERE = Path(__file__).resolve().parent
 
 
 @pytest.fixture
@@ -83,26 +76,3 @@ def test_a_peer_that_is_to_connect_to_nobody_misses_nobody(endpoint: str):
 )
 def test_which_far_end_is_which_endpoint(locator: str, endpoint: str, expected: bool):
     assert is_at(locator, endpoint) is expected
-
-
-def test_daemon_and_client_outlive_their_router(router: RouterProcess, endpoint: str):
-    """Killed, not stopped, and twice: transforms come again, from the same processes, and no one has complained."""
-    command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "routed"]
-    environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
-    daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        with Client("arm", "wrist", connect=[endpoint]) as client:
-            wait_until(lambda: client.latest().record, "the first transform")
-            for _ in range(2):
-                router.kill()
-                before = client.latest()
-                router.start()
-                wait_until(lambda seq=before.seq: client.latest().seq > seq + 10, "transforms after the restart")
-            assert client.latest().seq > 20
-        daemon.send_signal(signal.SIGTERM)
-        _, said = daemon.communicate(timeout=WAIT_S)
-    finally:
-        daemon.kill()
-        daemon.communicate()
-    assert daemon.returncode == 0
-    assert "Traceback" not in said and "error" not in said.lower() and "fails" not in said

@@ -27,6 +27,7 @@ from support.loopback import (
     can_bind,
     frame_record,
     free_endpoint,
+    free_port,
     plain_session,
     state_record,
     wait_until,
@@ -58,10 +59,6 @@ def only(found: dict[str, dict[tuple[tuple[str, str], ...], float]], name: str) 
     ((labels, value),) = found[name].items()
     assert labels == ()
     return value
-
-
-def free_port() -> int:
-    return int(free_endpoint().rsplit(":", 1)[1])
 
 
 @pytest.fixture

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import stats
-from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from gripmon.analyse.change_points import SIDE_FRAMES, squared_changes
 from gripmon.analyse.smoothing import SLOW_S, UNKNOWN_RATE_VARIANCE, UNKNOWN_VARIANCE, smooth
@@ -61,22 +59,6 @@ def test_what_was_not_measured_tells_nothing():
     alone = smooth(TIME_S[kept], Y[kept], VARIANCE[kept], RESTARTS[kept], SLOW, TURN)
     np.testing.assert_allclose(part.x[kept], alone.x, atol=1e-6)
     np.testing.assert_allclose(part.covariance[kept], alone.covariance, rtol=1e-4, atol=1e-6)
-
-
-def test_a_pose_that_stands_still_is_one_number():
-    smoothed = smooth(TIME_S, Y, VARIANCE, np.zeros(STEPS, bool), SLOW, np.zeros(2))
-    assert np.ptp(smoothed.x, axis=0).max() < 1e-6 and np.abs(smoothed.rate).max() < 1e-9
-    assert (np.ptp(smoothed.covariance[:, :, 0, 0], axis=0) < 1e-6).all()
-
-
-def test_vectors_and_poses_are_each_others_way_back():
-    vectors = RNG.normal(size=(20, 6)) * 0.5
-    origin = np.eye(4)
-    origin[:3, :3] = Rotation.random(rng=3).as_matrix()
-    poses = to_poses(origin, vectors)
-    expected = np.array([expm(np.cross(np.eye(3), v[3:])) @ origin[:3, :3] for v in vectors])
-    np.testing.assert_allclose(poses[:, :3, :3], expected, atol=1e-12)
-    np.testing.assert_allclose(to_vectors(origin, poses), vectors, atol=1e-12)
 
 
 def test_covariances_follow_the_chart():

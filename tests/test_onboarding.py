@@ -37,7 +37,7 @@ from gripmon.simulate import make_scenario, paper_rig
 from gripmon.simulate.background import _TILE_PX
 from gripmon.teach.hand_eye import HandEyeOnPlate, KnownGripper, UnknownGripper, calibrate_plane
 from gripmon.teach.outline_edges import measure_outlines
-from gripmon.teach.outlines import inferred_model, measure_known, outlines_of, points_in_gripper
+from gripmon.teach.outlines import inferred_model, measure_known, outlines_of
 
 TRUE = nominal_cam_T_grip()
 TARGETS: dict[str, Target] = {"discs": DISCS, "chequerboard": CHEQUERBOARD, "charuco": CHARUCO}
@@ -167,17 +167,6 @@ def test_the_inferred_gripper_is_the_true_one_and_a_monitor_takes_it():
     assert msgspec.convert(contents_of(model), type(model)) == model
 
 
-def test_points_of_an_outline_in_the_grippers_frame():
-    outline = outlines_of({name: (float(u), float(v)) for name, (u, v) in outline_pixels(TRUE).items()})
-    points_m = points_in_gripper(make_camera(PAPER_LENS), outline, outline.points, TRUE)
-    true = sharp_gripper().model.points
-    for name, point in zip(outline.names, points_m, strict=True):
-        finger, kind, side = name.split("_")
-        foot = f"{finger}_{'inner' if side == 'far' else 'outer'}_{side}" if kind == "rise" else name
-        want = np.array(true[true_name(foot)].xyz_m) - [0.0, 0.0, 0.025 if kind == "rise" else 0.0]
-        np.testing.assert_allclose(point, want, atol=1e-12)
-
-
 SQUARE = {
     f"{finger}_{kind}_{side}": (u, v)
     for finger, inner, outer in (("left", 240.0, 150.0), ("right", 540.0, 630.0))
@@ -212,26 +201,6 @@ def test_edges_of_an_inferred_gripper_have_names_of_their_own():
     assert len(model.edges) == len(full.edges)
     assert {"left_inner", "left_near", "left_rise_near", "right_end_far"} <= set(model.edges)
     assert model.jaw is None and all(f.motion is None for f in model.fingers.values())
-
-
-@pytest.mark.parametrize(
-    ("points", "reason"),
-    [
-        (
-            {**SQUARE, "thumb": (1.0, 2.0)},
-            "corners.thumb: is not a name of a fingertip's corner; one of left_inner_near",
-        ),
-        (without("right_inner_far"), "corners.right_inner_far: is missing"),
-        (without("left_outer_near"), "corners.left_inner_near: only one edge of its own is given; left_outer_near or"),
-        (
-            {**SQUARE, "left_end_near": (1.0, 1.0), "left_rise_near": (2.0, 2.0)},
-            "corners.left_end_near: is there beside left_rise_near",
-        ),
-    ],
-)
-def test_outlines_that_are_none(points: dict[str, tuple[float, float]], reason: str):
-    with pytest.raises(CalibrationError, match=reason):
-        outlines_of(points)
 
 
 @pytest.mark.parametrize(

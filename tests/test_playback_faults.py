@@ -16,13 +16,12 @@ from support.playback_runs import (
     altered,
     lines,
     messages,
-    new_recorder,
     records_of_a_run,
     table_of,
     write_rrd,
     write_run,
 )
-from support.recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
+from support.recorded import INTERVAL_NS, START_NS, record
 
 from gripmon.model.records import FrameRecord, State, to_json
 from gripmon.record import rrd
@@ -104,22 +103,6 @@ def test_cut_anywhere_never_raises(run: Run, tmp_path: Path):
         assert said and all(fault.startswith(str(tmp_path)) and "\n" not in fault for fault in said)
         counts.append(sum(len(r.frames) for r in collection.recordings))
     assert counts == sorted(counts) and counts[-1] == len(run.seqs[0])
-
-
-def test_a_killed_recording_process_leaves_a_file_that_reads(tmp_path: Path):
-    recorder = new_recorder(tmp_path / "live", max_file_bytes=10**9)
-    for i in range(50):
-        recorder.frame(frame(i), record(i), lambda: trace(0))
-    wait_until(lambda: recorder.frames_written == 50)
-    assert recorder.process_id is not None
-    os.kill(recorder.process_id, signal.SIGKILL)
-    (left,) = (tmp_path / "live").glob("*.rrd")
-    copy = Path(shutil.copy(left, tmp_path / "killed.rrd"))
-    recorder.close(5.0)
-    found = opened(copy)
-    assert [to_json(r) for r in found.records()] == [to_json(record(i)) for i in range(50)]
-    (fault,) = found.faults
-    assert fault.startswith(str(copy)) and ("no footer" in fault or "cut short" in fault)
 
 
 @pytest.mark.parametrize("footer", [True, False])

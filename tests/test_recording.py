@@ -335,17 +335,6 @@ def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
     )
 
 
-def test_a_script_without_a_guard_records_and_is_run_once(tmp_path: Path) -> None:
-    here = Path(__file__).parent
-    (tmp_path / "mine.py").write_text(
-        f"import sys; sys.path[:0] = [{str(here)!r}, {str(here.parent)!r}]\n"
-        "from pathlib import Path\nfrom support.recorded import *\nprint('once')\nw = recorder(Path('out'))\n"
-        "w.frame(frame(0), record(0), lambda: None)\nw.close(60.0)\nassert w.frames_written == 1, w.failure\n"
-    )
-    done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "once\n", "")
-
-
 def test_disabled_recording_touches_nothing(tmp_path: Path) -> None:
     writer = open_recorder(
         RecordingSettings(enabled=False),

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from support.daemon_bench import Bench
-from support.loopback import alert_record
 from support.recorded import Recorded, frame, record, recorder, trace, wait_until
 
 from gripmon.daemon.watch import DaemonSettings, Watch
@@ -28,19 +27,6 @@ LONG_S = 60.0
 
 def command(*arguments: str) -> None:
     subprocess.run(arguments, check=True, capture_output=True)
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """3 MB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    try:
-        command("mount", "-t", "tmpfs", "-o", "size=3m", "gripmon-test", str(place))
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("mounting a tmpfs is not allowed here")
-    yield place
-    command("umount", "--lazy", str(place))
 
 
 @pytest.fixture
@@ -72,25 +58,6 @@ def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
     written = writer.frames_written
     offer(writer, first, count)
     wait_until(lambda: writer.frames_written == written + count, LONG_S)
-
-
-def test_a_disk_that_is_read_only(small_disk: Path) -> None:
-    command("mount", "-o", "remount,ro", str(small_disk))
-    writer = recorder(small_disk)
-    wait_until(lambda: writer.failure is not None, LONG_S)
-    assert "recording failed: can't write" in str(writer.failure)
-    offer(writer, 0, 10)
-    wait_until(lambda: writer.dropped == 10, LONG_S)
-    writer.event(alert_record(text="recording failed"))
-    command("mount", "-o", "remount,rw", str(small_disk))
-    wait_until(lambda: writer.failure is None, LONG_S)
-    offer_and_wait(writer, 10, 10)
-    writer.close(60.0)
-    assert (writer.frames_written, writer.dropped) == (10, 10)
-    (path,) = small_disk.glob("*.rrd")
-    told = Recorded(path)
-    assert told.seqs() == list(range(10, 20))
-    assert any("recording failed" in str(cell.values["text"]) for cell in told.timed("events")), "why there is a gap"
 
 
 def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:

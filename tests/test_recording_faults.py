@@ -145,17 +145,6 @@ def test_close_ends_a_process_that_never_finishes(tmp_path: Path) -> None:
     assert not psutil.pid_exists(worker)
 
 
-def test_signals_for_the_daemon_s_group_don_t_end_the_recording(tmp_path: Path) -> None:
-    writer = recorder(tmp_path)
-    worker = running_worker(writer)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        os.kill(worker, number)
-    offer_and_wait(writer, 0, 5)
-    assert writer.process_id == worker
-    writer.close(60.0)
-    assert (writer.failure, writer.dropped) == (None, 0)
-
-
 def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,14 +282,6 @@ def test_close_releases_everything(tmp_path: Path) -> None:
     assert threading.active_count() == threads
     assert {child.pid for child in process.children()} <= children
     assert "gripmon-images" not in Path("/proc/self/maps").read_text()
-
-
-def test_a_recorder_that_is_closed_at_once_still_leaves_a_complete_file(tmp_path: Path) -> None:
-    writer = recorder(tmp_path)
-    offer(writer, 0, 3)
-    writer.close(60.0)
-    (path,) = tmp_path.glob("*.rrd")
-    assert Recorded(path).seqs() == [0, 1, 2]
 
 
 def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

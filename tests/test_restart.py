@@ -163,12 +163,6 @@ def test_the_state_revision_grows_with_every_change_and_only_then():
     assert told.done and told.monitor is not None and told.monitor.references == monitor.state().references
 
 
-def test_a_state_that_does_not_hold_together_is_an_error():
-    first, second = with_reference((0.0, 0.0, 0.0)).references
-    with pytest.raises(ValueError, match="revision 1 follows revision 2"):
-        restarted(MonitorState((second, first)))
-
-
 # --- as users meet it ---
 
 
@@ -242,7 +236,7 @@ def cell(tmp_path: Path, pictures: Path) -> Iterator[Cell]:
         yield Cell(tmp_path, pictures, session, endpoint)
 
 
-def test_a_damaged_file_is_set_aside_said_on_the_network_and_replaced(cell: Cell):
+def test_a_damaged_file_is_set_aside_and_said_on_the_network(cell: Cell):
     keep(cell.config, 2e-5)
     cell.kept.write_bytes(cell.kept.read_bytes()[:-100])
     with cell.monitor():
@@ -251,10 +245,6 @@ def test_a_damaged_file_is_set_aside_said_on_the_network_and_replaced(cell: Cell
     text = str(cell.alerts[0]["text"])
     assert cell.alerts[0]["kind"] == "restarted" and "is damaged" in text and "kept.json.damaged-1" in text
     assert (cell.folder / "kept.json.damaged-1").is_file()
-    with cell.monitor():
-        cell.wait_valid()
-        wait_until(lambda: cell.alerts, "the alert")
-    assert "damaged" not in str(cell.alerts[0]["text"]), "what was written since is whole"
 
 
 def test_a_changed_calibration_and_a_fresh_start_begin_anew_with_the_next_revision(cell: Cell):
@@ -273,19 +263,6 @@ def test_a_changed_calibration_and_a_fresh_start_begin_anew_with_the_next_revisi
         "kept.json.replaced-1",
         "kept.json.replaced-2",
     ]
-
-
-def test_a_folder_that_can_not_be_written_is_said_and_the_monitor_goes_on(cell: Cell):
-    (cell.folder / "a-file").write_text("x")
-    cell.config.write_text(cell.config.read_text().replace("kept.json", "a-file/kept.json"))
-    with cell.monitor():
-        cell.wait_valid()
-        wait_until(
-            lambda: any("state not kept" in str(s["message"]) for s in ask(cell.session, f"{ROBOT}/state")),
-            "the message",
-        )
-        count = len(cell.transforms)
-        wait_until(lambda: len(cell.transforms) > count + 5, "more transforms")
 
 
 def test_a_command_to_nobody_is_one_line_and_exit_code_3(cell: Cell):

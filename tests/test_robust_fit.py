@@ -258,17 +258,6 @@ def test_the_grid_finds_what_is_out_of_the_reach_of_the_start():
     assert best.share > 0.8 > fit(found).share
 
 
-def test_the_grid_shifts_turns_and_scales_the_image_by_what_it_says():
-    starts = grid_of_starts(PREDICTION, 6.0, 2.0)
-    assert len(starts) == 7 * 7 * 3 * 3
-    assert not starts[:, [3, 4, 6]].any(), "tilts and the jaw are left to the fit"
-    only_x = np.zeros(7)
-    only_x[0] = 2.0 / PREDICTION.pixels_per_m
-    assert (np.abs(starts - only_x).max(axis=1) < 1e-12).any()
-    # No start moves the image by more than its parts together.
-    assert np.abs(starts @ PREDICTION.jacobian.T).max() < 3.0 * 6.0
-
-
 def test_the_prior_holds_the_jaw_at_what_is_reported():
     """With a sharp report the seen opening is the reported one, with a vague one it is what the edges show."""
     opened = np.zeros(7)

@@ -75,36 +75,6 @@ def test_means_of_windows_scatter_as_those_of_an_ar_process(memory: float):
         assert share(of_mean[k]) == pytest.approx(expected, rel=0.15, abs=rest)
 
 
-def test_the_sum_over_octaves_is_the_variance_of_the_means():
-    """Haar: what is left of the mean's variance at the longest length, plus all differences over four."""
-    rng = np.random.default_rng(2)
-    scatter = learnt(3.0 * autocorrelated(rng, FRAMES, STREAMS, 0.5))
-    of_mean, of_difference = covariances(scatter, 1e-6 * claimed(STREAMS), NO_MORE)
-    for k in range(len(LENGTHS) - 1):
-        np.testing.assert_allclose(of_mean[k], of_mean[k + 1] + 0.25 * of_difference[k], rtol=1e-4, atol=1e-16)
-    np.testing.assert_allclose(of_mean[-1], 0.5 * of_difference[-1], rtol=1e-4, atol=1e-16)
-    np.testing.assert_allclose(scatter.of_single_frames() + 0.25 * scatter.of_differences[-1], of_mean[0], rtol=1e-4)
-    more, _ = covariances(scatter, 1e-6 * claimed(STREAMS), 5.0 * NO_MORE)
-    np.testing.assert_allclose(more, 5.0 * of_mean, rtol=1e-4)
-
-
-def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
-    """Noise with a fourth of the claimed variance in three directions, and four times of it in the others."""
-    rng = np.random.default_rng(3)
-    factor = np.linalg.cholesky(COVARIANCE)
-    size = np.array([0.5, 0.5, 0.5, 2.0, 2.0, 2.0])
-    shifts = (rng.normal(size=(FRAMES, STREAMS, 6)) * size) @ factor.T
-    of_mean, of_difference = covariances(learnt(shifts), claimed(STREAMS), NO_MORE)
-    inverse = np.linalg.inv(factor)
-    white = (inverse @ of_mean.mean(axis=1) @ inverse.T).diagonal(axis1=1, axis2=2)
-    assert white[0, :3] == pytest.approx(np.full(3, 1.15), abs=0.2), "single frames: what they claim, at least"
-    assert white[0, 3:] == pytest.approx(np.full(3, 4.0), rel=0.2), "and what they show where that is more"
-    long = LENGTHS.index(256)
-    assert (white[long, :3] > 0.4).all(), "bias is not averaged away"
-    assert (white[long, 3:] < 0.4).all(), "noise is"
-    assert share(of_difference[long]) > 2.0 * 0.4 * 0.5, "two backgrounds have two biases"
-
-
 def test_before_anything_was_seen_means_are_worth_about_what_frames_claim():
     scatter = Scatter(1)
     scatter.begin(claimed(1))

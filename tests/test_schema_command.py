@@ -1,43 +1,23 @@
-"""``gripmon schema`` against what is really published, judged by another implementation of JSON Schema."""
+"""``gripmon schema`` against what is sent, judged by another implementation of JSON Schema."""
 
 from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator
 
 import jsonschema
 import msgspec
 import pytest
-import zenoh
-from support.loopback import (
-    alert_record,
-    frame_record,
-    free_endpoint,
-    plain_session,
-    reference_record,
-    state_record,
-    wait_until,
-)
-from support.published import Published
+from support.sample_messages import SAMPLES, kept
 from test_schemas import ONE_OF_EACH
 
 from gripmon.cli import main
 from gripmon.cli.network import _MESSAGES as _NAMES
-from gripmon.io.wire import PublishSettings
 from gripmon.model.records import (
     MESSAGES,
-    Command,
-    CommandName,
-    CommandReply,
-    CornerFault,
-    CornerRecord,
-    Frame,
-    MonitorState,
     json_schema,
     schema_name,
     to_json,
-    unmeasured_record,
 )
 
 
@@ -51,80 +31,15 @@ def validator(schema: dict) -> jsonschema.Draft202012Validator:
     return jsonschema.Draft202012Validator(schema)
 
 
-NULLS = unmeasured_record(Frame(8, 5, None), reference_record(), "black", corners=(
-    CornerRecord("L_in_near", None, None, used=False, reason=CornerFault.FRAME_REFUSED),
-))  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def heard() -> Iterator[dict[str, list[object]]]:
-    """What a plain subscriber and a plain asker get of each message."""
-    endpoint = free_endpoint()
-    publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
-    try:
-        with plain_session(connect=endpoint) as session:
-            yield {
-                "transform": [
-                    said(session, "transform", lambda: publisher.transform(frame_record())),
-                    said(session, "transform", lambda: publisher.transform(NULLS), NULLS.seq),
-                ],
-                "state": [said(session, "state", lambda: publisher.event(state_record()))],
-                "alert": [said(session, "alert", lambda: publisher.event(alert_record()))],
-                "reference": [said(session, "reference", lambda: publisher.event(reference_record()))],
-                "reply": [asked(session, publisher, "state", None)],
-                "error": [asked(session, publisher, "explode", None), asked(session, publisher, "undo", b"no JSON")],
-            }
-    finally:
-        publisher.close()
-
-
-def said(session: zenoh.Session, leaf: str, put: object, seq: int | None = None) -> object:
-    """What arrives on a key, of that frame if one is named."""
-    subscriber = session.declare_subscriber(f"gripmon/arm/wrist/{leaf}")
-    heard: list[object] = []
-
-    def arrived() -> bool:
-        put()  # type: ignore[operator]
-        while (sample := subscriber.try_recv()) is not None:
-            message = json.loads(sample.payload.to_bytes())
-            if seq is None or message["seq"] == seq:
-                heard.append(message)
-        return bool(heard)
-
-    wait_until(arrived, leaf)
-    return heard[-1]
-
-
-def asked(session: zenoh.Session, publisher: Published, name: str, payload: bytes | None) -> object:
-    replies = session.get(f"gripmon/arm/wrist/cmd/{name}", payload=payload, timeout=20.0)
-    if name == "state":
-        pending: list[object] = []
-        wait_until(lambda: (got := publisher.commands.poll()) is not None and not pending.append(got), "the command")
-        assert pending[0].command == Command(CommandName.STATE)  # type: ignore[attr-defined]
-        state = MonitorState((reference_record(),), reference_record(1), (), 3, None, None)
-        pending[0].answer(CommandReply(CommandName.STATE, True, "well", "plate-2", 3, state))  # type: ignore[attr-defined]
-    (reply,) = replies
-    return json.loads((reply.ok or reply.err).payload.to_bytes())
-
-
-@pytest.mark.parametrize("name", ["transform", "state", "alert", "reference", "reply", "error"])
-def test_what_is_published_validates(heard: dict[str, list[object]], name: str, capsys: pytest.CaptureFixture[str]):
-    one, every = (validator(json.loads(printed(capsys, *which))) for which in ([name], []))
-    for message in heard[name]:
-        one.validate(message)
-        every.validate(message)
-
-
-def test_the_null_transform_is_one(heard: dict[str, list[object]]):
-    assert heard["transform"][1]["cam_T_grip"] is None  # type: ignore[index]
-    assert heard["transform"][0]["cam_T_grip"] is not None  # type: ignore[index]
-
-
-@pytest.mark.parametrize("name", MESSAGES)
-def test_one_of_each_validates_against_its_own_schema_and_no_other(name: str):
-    message = json.loads(to_json(ONE_OF_EACH[name]))
-    passed = [other for other in MESSAGES if validator(json_schema((other,))).is_valid(message)]
-    assert passed == [name]
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_what_is_sent_validates_against_its_own_schema_and_no_other(
+    sample: str, capsys: pytest.CaptureFixture[str]
+):
+    """As printed; what is really published has these bytes (test_wire_samples.py, test_publish.py)."""
+    message = json.loads(kept(sample))
+    (name,) = (name for name in MESSAGES if type(SAMPLES[sample]) is MESSAGES[name])
+    assert [other for other in MESSAGES if validator(json.loads(printed(capsys, other))).is_valid(message)] == [name]
+    validator(json.loads(printed(capsys))).validate(message)
 
 
 FROM_OTHERS = dict.fromkeys(("jaw", "command", "frame"), ("schema",))

@@ -480,8 +480,10 @@ def test_steps_as_commands(images: Path, tmp_path: Path, capsys: pytest.CaptureF
     # A command that fails says why, and what was there stays.
     project = Project(folder)
     project.keep({"target": "chequerboard:9x6:0.02"})
+    for path in sorted((folder / "plate").glob("*.png"))[2:]:  # a target is searched in vain for long
+        path.unlink()
     before = (folder / "camera.yaml").read_bytes()
-    with pytest.raises(NoResultError, match="none of 12 images shows the target"):
+    with pytest.raises(NoResultError, match="none of 2 images shows the target"):
         project.do("intrinsics")
     assert (folder / "camera.yaml").read_bytes() == before
 

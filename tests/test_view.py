@@ -24,7 +24,7 @@ from support import recorded
 from support.configurations import shipped, with_sections
 from support.gripmon_process import GRIPMON
 from support.headless import needs_chromium, picture_of
-from support.loopback import WAIT_S, free_endpoint, wait_until
+from support.loopback import WAIT_S, free_port, wait_until
 from support.network_daemon import ENVIRONMENT
 
 from gripmon.cli import main
@@ -35,10 +35,6 @@ from gripmon.record.write import ProcessRecorder, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"
 MAGENTA = (255, 0, 255)
-
-
-def free_port() -> int:
-    return int(free_endpoint().rsplit(":", 1)[1])
 
 
 def live_recorder(folder: Path, view: ViewSettings, settings: RecordingSettings) -> ProcessRecorder:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-import msgspec
 import pytest
 import zenoh
 from support.loopback import (
@@ -24,7 +23,7 @@ from support.published import Published
 from support.sample_messages import FOLDER, SAMPLES, kept, payload
 
 from gripmon.io.wire import PublishSettings
-from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
+from gripmon.model.records import MESSAGES, from_json, schema_name
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "reference" / "wire.md").read_text(encoding="utf-8")
 
@@ -49,12 +48,6 @@ def test_the_folder_holds_these_samples_and_nothing_else():
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_reads_them(name: str):
     assert from_json(kept(name), type(SAMPLES[name])) == SAMPLES[name]
-
-
-def test_a_transform_of_an_older_monitor_has_no_protection_level():
-    older = {field: value for field, value in json.loads(kept("transform")).items() if field != "protection"}
-    read = from_json(json.dumps(older).encode(), FrameRecord)
-    assert read.protection is None and read == msgspec.structs.replace(SAMPLES["transform"], protection=None)
 
 
 def test_there_is_a_sample_of_every_message():

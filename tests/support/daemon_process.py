@@ -30,8 +30,7 @@ if __name__ == "__main__":
     log_to_stderr()
     transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
     with signals_exit() as stop:
-        routed = PublishSettings(mode="client", connect=(endpoint,))
-        publisher = Published(routed if kind == "routed" else PublishSettings(listen=(endpoint,)), "arm", "wrist")
+        publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
         if kind == "forgetful":
             raise SystemExit(5)  # without closing the publisher
         if kind == "starting":

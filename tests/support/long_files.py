@@ -66,7 +66,6 @@ LONGEST = (
     "test_bench_real",
     "test_view",
     "test_held",
-    "test_dead_writer",
     "test_accuracy_forecast",
     "test_sweep_command",
     "test_offline_correction",

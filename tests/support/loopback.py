@@ -49,6 +49,11 @@ def free_endpoint() -> str:
             return endpoint
 
 
+def free_port() -> int:
+    """Its number alone."""
+    return int(free_endpoint().rpartition(":")[2])
+
+
 def can_bind(endpoint: str) -> bool:
     """Could another program listen there?"""
     with socket.socket() as probe:
