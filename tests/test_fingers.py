@@ -214,3 +214,14 @@ def test_between_jaws_that_meet_is_background_though_edges_that_stay_enclose_it(
     kept = enclosed(edges_that_stay(pictures(jaws & ~hole, count, False)))
     assert kept is not None and kept[jaws & ~hole].mean() > 0.95
     assert kept[cv2.erode(hole.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0].mean() < 0.05
+
+
+def test_fingers_on_shoulders_as_wide_as_the_gap_between_them_end_above_these():
+    """Of one the shoulder slopes to half of the valley's depth, as on a jaw that carries its own motor."""
+    left = [(60, 0), (60, 70), (80, 75), (80, 130), (105, 150), (120, 130), (130, 90), (190, 80), (230, 20), (230, 0)]
+    right = [(230, 0), (230, 20), (270, 70), (265, 90), (250, 150), (275, 150), (319, 120), (319, 0)]
+    still = polygons(left, right)
+    parts = find_fingers(still, sure(still))
+    assert len(parts.fingers) == 2 and parts.rest[10, 200]
+    assert parts.fingers[0][140, 105] and parts.fingers[1][140, 260]
+    assert all(outwards[1] > 0.7 for outwards in parts.outwards)

@@ -141,6 +141,35 @@ def test_a_refusal_names_an_image_of_the_opening_that_it_is_about() -> None:
     assert caught.value.image == 2
 
 
+def test_of_fingers_whose_tips_end_differently_the_outline_lies_right_at_every_opening() -> None:
+    """Perspective takes both tips to end equally far out: one that is 12 mm shorter would be 9 % too near."""
+    from benchmarks.meshes import MeshCamera, box_fingers
+    from benchmarks.outlines import points_on, projected_outline
+
+    meshes = box_fingers()
+    meshes[1].apply_translation([0.0, 0.0, -0.012])
+    pictures = MeshCamera(CAMERA, meshes, 5)
+    gaps_m = [GAP_M] * 8 + [0.024] * 8
+    images = [pictures.picture(POSE, offsets_m(gap)) for gap in gaps_m]
+    found = gripper_from_images(images, PAPER_LENS, openings_m=gaps_m)
+    for gap in set(gaps_m):
+        lines = projected_outline(found.gripper, CAMERA, found.cam_T_grip, gap)
+        written = points_on(lines, (CAMERA.width_px, CAMERA.height_px))
+        true = silhouette_px(pictures.coverage(POSE, offsets_m(gap)))
+        away = [np.linalg.norm(true - point, axis=1).min() for point in written]
+        assert len(away) > 800 and np.quantile(away, 0.95) < 0.2
+    # How the jaws move is where x points: what one camera can't tell of that is in the reference's covariance.
+    off = perturbation_between(POSE, found.cam_T_grip)[3:]
+    assert (np.abs(off) < 2.0 * np.sqrt(np.diag(found.covariance)[3:])).all()
+
+
+def silhouette_px(coverage: Array) -> Array:
+    """Points (n, 2) where half of a pixel is covered, to an eighth of it."""
+    fine = cv2.resize(coverage, None, fx=8.0, fy=8.0, interpolation=cv2.INTER_LINEAR) > 0.5
+    found, _ = cv2.findContours(fine.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return np.asarray((np.vstack([contour[:, 0] for contour in found]) + 0.5) / 8.0 - 0.5)
+
+
 def test_one_finger_has_an_outline_and_says_what_is_taken_for_granted() -> None:
     from benchmarks.meshes import MeshCamera
 
@@ -188,7 +217,8 @@ def test_fingers_that_hang_together_in_the_image_are_told_apart() -> None:
     assert abs(min(shown_m) - 0.024) < 3e-4 and abs(max(shown_m) - 0.034) < 3e-4
     apart = perturbation_between(POSE, found.cam_T_grip)
     sigma_rad = np.sqrt(np.diag(found.covariance)[3:])
-    assert np.abs(apart[:3]).max() < 4e-4 and sigma_rad.max() < np.radians(0.5)
+    # Of the jaws' direction, about the fingers, motion tells less than perspective tells of theirs.
+    assert np.abs(apart[:3]).max() < 4e-4 and sigma_rad[0] < np.radians(0.5) and sigma_rad.max() < np.radians(4.0)
     assert (np.abs(apart[3:]) < 3.0 * sigma_rad).all()
 
 

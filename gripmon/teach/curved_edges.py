@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 
 from gripmon.model.camera import Camera
+from gripmon.model.gripper.model import MOST_VIA
 from gripmon.model.records import Array
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.piece_lines import LEAST_SCATTER_PX, STRAIGHT_PX
@@ -68,6 +69,8 @@ def smooth_curve(
     knots = curve.t[3:-3]
     via = np.sort(np.concatenate([knots[1:-1], 0.5 * (knots[1:] + knots[:-1])]))
     via = via[(via > first + 0.5 * KNOTS_PX) & (via < last - 0.5 * KNOTS_PX)]
+    if len(via) > MOST_VIA:  # along a whole side of a finger in a large image
+        via = via[np.rint(np.linspace(0.0, len(via) - 1.0, MOST_VIA)).astype(int)]
     points = curve(via)
     ends = [curve(at_px) for at_px in (first, last)]
     for end in (0, -1):

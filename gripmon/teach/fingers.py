@@ -24,8 +24,8 @@ the image that a lens hides, or a housing, is flatter; a finger cut off by a cor
 LEAST_VALLEY = 0.25
 """Least depth of the space between two fingers of one part, over the distance of their tips."""
 LEAST_STEEPNESS = 1.2
-"""Least rise of both sides of that space over their way along the line between the tips: 50°.  In the corner
-between one finger and what carries it, of 90° or so, a side has 45° at most."""
+"""Least rise of both sides of that space over their way along the line between the tips: 50°, as far down as they have
+it.  In the corner between one finger and what carries it, of 90° or so, a side has 45° at most."""
 PRONGS_SHARE = 0.5
 """Least share of a part's outline in view that its two fingers have; a notch in one finger's tip leaves less."""
 ALIKE_OUTLINES = 0.3
@@ -202,8 +202,8 @@ def _ends_within(part: Bits, border: Bits) -> bool:
 
 
 def _cut(part: Bits) -> tuple[Array, float] | None:
-    """A line along the bottom of the valley between two fingers: its unit normal (2,) towards their tips, and its level
-    along that; None where there is no such valley.
+    """A line along the bottom of the valley between two fingers, or where their sides end above a shoulder of what
+    carries them: its unit normal (2,) towards their tips, and its level along that; None where there is no such valley.
     """
     contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = max(contours, key=len)
@@ -225,7 +225,11 @@ def _cut(part: Bits) -> tuple[Array, float] | None:
         below = (valley - tips[0]) @ normal
         normal *= -1.0 if abs(below.max()) > abs(below.min()) else 1.0
         below = np.abs(below)
-        if not _steep(below, (valley - tips[0]) @ chord):
+        level = _steep_to(below, (valley - tips[0]) @ chord, LEAST_VALLEY * apart)
+        if level is None or (best is not None and level <= best[0]):
+            continue
+        if level < below.max():
+            best = level, normal, float(tips[0] @ normal) - level
             continue
         bottom = valley[below > _BOTTOM * below.max()]
         spread = bottom - bottom.mean(axis=0)
@@ -235,18 +239,21 @@ def _cut(part: Bits) -> tuple[Array, float] | None:
             way = chord
         across = np.array([-way[1], way[0]])
         across *= np.sign(float(across @ normal)) or 1.0
-        if best is None or depth > best[0]:
-            best = depth, across, float((bottom @ across).max()) + 1.0
+        best = level, across, float((bottom @ across).max()) + 1.0
     return None if best is None else (best[1], best[2])
 
 
-def _steep(below: Array, along: Array) -> bool:
-    """Whether both sides of a valley are steep: its points, in order, lie ``below`` (n,) and ``along`` (n,) a
-    line from tip to tip.
+def _steep_to(below: Array, along: Array, least: float) -> float | None:
+    """The largest depth, ``least`` or more, to which both sides of a valley are steep, from its bottom upwards: its
+    points, in order, lie ``below`` (n,) and ``along`` (n,) a line from tip to tip.
     """
-    high, low = (along[below >= part * below.max()] for part in _FLANK)
+    return next((level for level in np.arange(below.max(), least, -1.0).tolist() if _steep(below, along, level)), None)
+
+
+def _steep(below: Array, along: Array, depth: float) -> bool:
+    high, low = (along[below >= part * depth] for part in _FLANK)
     run = max(low[0] - high[0], high[-1] - low[-1])
-    return bool(run * LEAST_STEEPNESS < (_FLANK[1] - _FLANK[0]) * below.max())
+    return bool(run * LEAST_STEEPNESS < (_FLANK[1] - _FLANK[0]) * depth)
 
 
 def _ends_in_view(tips: Array, shape: tuple[int, ...]) -> bool:

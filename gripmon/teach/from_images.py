@@ -30,7 +30,7 @@ from gripmon.teach.fingers import Box, UnclearPartsError
 from gripmon.teach.image_borders import WELL_SEEN
 from gripmon.teach.image_drawing import draw_outlines
 from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines
-from gripmon.teach.image_motion import SAME_OPENING_M
+from gripmon.teach.image_motion import SAME_OPENING_M, WORST_OUTLINE_PX
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
 from gripmon.teach.matte import FEWEST_IMAGES, STRONG_BLOCKS, blocks, grey_levels, image_sets, smallest_noise
@@ -39,8 +39,6 @@ from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
 
 MOST_IMAGES = 200
-WORST_OUTLINE_PX = 1.0
-"""Standard deviation of an outline from which it is refused: search lines at work reach 3 px to either side."""
 
 
 @dataclass(frozen=True, kw_only=True)

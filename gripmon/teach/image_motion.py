@@ -16,6 +16,8 @@ from gripmon.teach.vanishing import ALONG_RAD, Outline
 
 SAME_OPENING_M = 5e-5
 """Openings closer than this count as one: about 0.2 px of each finger, 100 mm away."""
+WORST_OUTLINE_PX = 1.0
+"""Standard deviation of an outline from which it is of no use: search lines at work reach 3 px to either side."""
 ROUGH_TIP_SHARE = 0.35
 """Part of a finger's length that is its tip, which is at one depth."""
 ROUGH_STEP_PX = 2.0
@@ -42,9 +44,10 @@ class FingerMoved:
 class JawMotion:
     """``q`` of each finger (v,): inverse depths of its vertices, and its ``kept`` pieces, whose depth is known,
     ``by_motion`` or by perspective; ``moved`` by opening: each finger's motion over the tips' depth; ``travel`` (o,) of
-    the fingers against each other, over that depth, with its ``covariance`` (o, o); ``direction`` (3,) of the travel,
-    ``slope_sigma`` (2,) of the inverse depths over x and y; ``tcp_covariance`` (3, 3) of the tips' middle over that
-    depth; ``turned``: why they turn while they move, if they do.
+    the fingers against each other, over that depth, with its ``covariance`` (o, o); ``direction`` (3,) of the travel
+    with its ``direction_covariance`` (3, 3), ``slope_sigma`` (2,) of the inverse depths over x and y;
+    ``tcp_covariance`` (3, 3) of the tips' middle over that depth; ``turned``: why they turn while they move, if they
+    do.
     """
 
     q: tuple[Array, ...]
@@ -54,6 +57,7 @@ class JawMotion:
     travel: Array
     covariance: Array
     direction: Array
+    direction_covariance: Array
     slope_sigma: Array
     tcp_covariance: Array
     turned: str

@@ -334,5 +334,10 @@ class _Fit(Jaws):
         for tip in self.tips:
             at_q[:, tip] = -(self.rays[tip] / np.square(q[tip, None])).T / (len(tip) * len(self.tips))
         tcp = at_q @ best.covariance @ at_q.T
+        # The unit vector of (cos, sin of an angle, rise) over both.
+        flat, first = math.hypot(way[0], way[1]), len(q) + self.extra
+        aside, ahead = np.array([-way[1], way[0], 0.0]) / flat, np.array([*way[:2] * -way[2] / flat, flat])
+        by = np.column_stack([aside * flat, ahead * flat**2])
+        ways = by @ best.covariance[first : first + 2, first : first + 2] @ by.T
         depths = of_each, self.kept, self.placed is None
-        return JawMotion(*depths, moved, travel, covariance, way, slope_sigma, tcp, turned)
+        return JawMotion(*depths, moved, travel, covariance, way, ways, slope_sigma, tcp, turned)

@@ -14,7 +14,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 from gripmon.teach.finger_depth import FLAT_SIGMA_RAD, PlacedOutlines
-from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit, along_finger, contact
+from gripmon.teach.image_motion import WORST_OUTLINE_PX, FingerMoved, JawMotion, Unfit, along_finger, contact
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_fit import fit_motion
 from gripmon.teach.vanishing import Outline
@@ -96,8 +96,8 @@ def _move(
             return placed, Moved({}, None, found.turned)
         if found.by_motion:
             placed, found = place_by_motion(fingers, found, pose, absolute=travel is not None)
-        elif pose is None:
-            placed = _across_travel(placed, found.direction)
+        else:
+            placed, found = _as_they_move(camera, fingers, placed, found, keep=pose is not None)
         return placed, Moved(found.moved, found)
     except Unfit as unfit:
         if unfit.opening is not None:
@@ -111,12 +111,52 @@ def _move(
     return placed, Moved(found.moved, found)
 
 
-def _across_travel(placed: PlacedOutlines, direction: Array) -> PlacedOutlines:
-    """With x as the jaws move, square to the fingers: which of the tips' vertices face each other tells less."""
+def _as_they_move(
+    camera: Camera, fingers: Sequence[Outline], placed: PlacedOutlines, found: JawMotion, *, keep: bool
+) -> tuple[PlacedOutlines, JawMotion]:
+    """The fingers where perspective places them, or, where their outlines would then lie beside the images of another
+    opening, at the depths by which their motion is explained: that both tips end equally far out, and a round one in
+    the plane of its sides, is assumed.  Unless a calibration's axes are to be kept (``keep``), the TCP moves with the
+    tips, and x is as the jaws move, square to the fingers: which of the tips' vertices face each other tells less.
+    """
+    points = [np.column_stack([f.xy, np.ones(len(f.xy))]) / q[:, None] for f, q in zip(fingers, found.q, strict=True)]
+    points = [np.where(np.isfinite(old), new, np.nan) for old, new in zip(placed.points, points, strict=True)]
+    tcp = placed.tcp
+    if _beside_px(camera, placed, points, found) >= WORST_OUTLINE_PX:
+        tips, _ = contact(fingers, found.direction[:2] / float(np.linalg.norm(found.direction[:2])))
+        moved = [(new - old)[tip] for new, old, tip in zip(points, placed.points, tips, strict=True)]
+        moved = [own[np.isfinite(own).all(axis=1)] for own in moved]
+        tcp = tcp if keep else tcp + np.mean([own.mean(axis=0) for own in moved if len(own)], axis=0)
+        # Of a plane through each finger's points, as they are now.
+        tilt_sigma_rad = max(placed.tilt_sigma_rad, float(found.slope_sigma.max()))
+        placed = replace(placed, points=tuple(points), tilt_sigma_rad=tilt_sigma_rad)
+    if keep:
+        return placed, found
     along = placed.rotation[:, 2]
-    across = direction - along * float(along @ direction)
+    across = found.direction - along * float(along @ found.direction)
     across *= np.sign(float(across @ placed.rotation[:, 0])) / np.linalg.norm(across)
-    return replace(placed, rotation=np.column_stack([across, np.cross(along, across), along]))
+    rotation = np.column_stack([across, np.cross(along, across), along])
+    about_along = float(np.sqrt(rotation[:, 1] @ found.direction_covariance @ rotation[:, 1]))
+    sigma = np.hypot(placed.sigma_rad, about_along * np.abs(along))
+    depth = float(tcp[2])
+    placed = replace(placed, points=tuple(own / depth for own in placed.points), tcp=tcp / depth)
+    return replace(placed, rotation=rotation, sigma_rad=sigma), found.over(depth)
+
+
+def _beside_px(camera: Camera, placed: PlacedOutlines, points: Sequence[Array], found: JawMotion) -> float:
+    """How far the outlines that perspective places, moved to the other openings, lie beside those at ``points`` (v, 3)
+    of each finger, which the motion explains: root mean square across the edges.
+    """
+    off = []
+    for motion in found.moved.values():
+        for old, new, kept, own in zip(placed.points, points, placed.kept, motion, strict=True):
+            ends = np.reshape(kept, (-1, 2)).astype(int)
+            before, after = (p[ends] + own.shift for p in (old, new))  # (e, 2, 3)
+            before, after = (p[..., :2] / p[..., 2:] for p in (before, after))
+            way = after[:, 1] - after[:, 0]
+            normal = np.column_stack([-way[:, 1], way[:, 0]]) / np.linalg.norm(way, axis=1)[:, None]
+            off.append(np.einsum("ekc,ec->ek", before - after, normal).ravel())
+    return camera.fx_px * float(np.sqrt(np.square(np.concatenate(off)).mean()))
 
 
 def place_by_motion(

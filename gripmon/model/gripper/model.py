@@ -71,6 +71,8 @@ them broken by 0.1 to 0.3 mm, as is usual for machined parts.
 """
 
 WIDEST_BEVEL_M = 0.02
+MOST_VIA = 62
+"""Most points on a curved edge between its ends."""
 
 
 class EdgeModel(
@@ -82,7 +84,8 @@ class EdgeModel(
     brighter: Literal["left", "right", "any"] = "any"
     bevel_m: Annotated[float, Meta(ge=0.0, le=WIDEST_BEVEL_M, description="width of a bevel or rounding (m)")] = 0.0
     via: Annotated[
-        tuple[Vector, ...], Meta(max_length=62, description="a curved edge: points on it in turn, without its ends (m)")
+        tuple[Vector, ...],
+        Meta(max_length=MOST_VIA, description="a curved edge: points on it in turn, without its ends (m)"),
     ] = ()
 
 

@@ -17,6 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from gripmon.model.gripper.model import MOST_VIA
 from gripmon.model.gripper.rounds import LARGEST_RADIUS_M
 from gripmon.model.records import Array
 from gripmon.teach.cad.curves import Curve, curves_of, pieces_of
@@ -53,7 +54,6 @@ TURN_RAD = 0.524
 LARGEST_GAP_PX = 8.0
 """Largest gap over which two straight edges are extended to a corner: the monitor doesn't sample so close to one."""
 
-MOST_VIA = 62  # of a gripper file
 _AROUND_PX = 3.0
 _TOGETHER_PX = 0.75
 _LONGEST_GAP_PX = 2.0
