@@ -413,7 +413,7 @@ class Integrity:
         """Whether the gripper's look is seen at a pose (4, 4)."""
         if not self._look.ready or frame.image is None:
             return False
-        return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_ODDS)
+        return self._look.supports(frame.image, cam_T_grip, measurement.jaw_opening_m, LOOK_ODDS)
 
 
 def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
