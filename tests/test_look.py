@@ -26,7 +26,7 @@ from gripmon.simulate.scenario import (
     Shadow,
 )
 from gripmon.track.look import GripperLook, LookAgreement
-from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S, MANY_VIEWS, RELEARN_S
+from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S, MANY_VIEWS, RELEARN_S, SLIDES_M
 
 RISK = 1e-5
 LEARNT = 16
@@ -87,6 +87,22 @@ def test_a_textured_finger_is_recognised_where_it_is_and_nowhere_along_it():
     assert agreement.supports(RISK) and not agreement.contradicts(RISK)
     for pose in range(1, 1 + len(TELLING_SLIDES_M)):
         assert agreement.contradicts(RISK, pose)
+
+
+def test_a_look_that_is_seen_as_well_some_way_along_the_fingers_supports_no_place(monkeypatch: pytest.MonkeyPatch):
+    """Streaks along a finger: many patches agree where it has slid by less than a patch is long."""
+    simulation, look = ordinary()
+    truth, image = simulation.truth(24), simulation.render(24)
+    assert look.supports(image, truth.cam_T_grip, truth.jaw_opening_m, RISK)
+    for way_m in SLIDES_M:
+        assert not look.supports(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+    enough = -np.log(RISK)
+    for best, seen in ((0.0, True), (1.0, True), (enough - 1.0, False), (2.0 * enough, False)):
+        odds = np.zeros((1 + 2 * len(SLIDES_M), 2))
+        odds[0], odds[3] = enough, best
+        none = np.zeros(odds.shape, dtype=np.intp)
+        monkeypatch.setattr(look, "compare", lambda *_, odds=odds, none=none: LookAgreement(odds, none, none, odds))
+        assert look.supports(image, truth.cam_T_grip, truth.jaw_opening_m, RISK) == seen, best
 
 
 def test_a_slightly_better_pose_contradicts_nothing():

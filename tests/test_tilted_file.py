@@ -17,8 +17,9 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import skew
 from gripmon.model.gripper import EdgeModel, FaceModel, FingerModel, Gripper, GripperModel, PointModel, contents_of
 from gripmon.model.records import Array, ReferenceRecord, ValidBy
-from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.monitor import Monitor, MonitorSettings, Tracker
 from gripmon.monitor.common import EXACT_PLANE, CommonError, Tilt
+from gripmon.monitor.possible import Possible
 from gripmon.simulate import Scenario, paper_rig
 from gripmon.simulate.scenario import Background, Bump, FingerLook
 from gripmon.teach.finger_depth import USUAL_TILT_RAD, USUAL_TILT_SIGMA_RAD, place
@@ -392,3 +393,24 @@ def test_by_the_true_motion_bounds_hold_whether_the_mount_stayed_or_was_knocked_
     assert bound_m < 0.85 * beyond("by what fits show", odds, risk)[2]
     every, knocked, _ = beyond("as of a mount that stays", odds, risk)
     assert every > 3.0 * risk and knocked > risk / odds
+
+
+@pytest.mark.parametrize("sigma_rad", [0.0, USUAL_TILT_SIGMA_RAD])
+def test_the_receding_edge_of_a_thick_fingers_end_is_doubted_with_the_end(sigma_rad: float):
+    """In the plane of a file from images it runs along the finger, as a side does that has a bend."""
+    outline = np.array([(12.0, -60.0), (12.0, 0.0), (2.0, 0.0), (0.0, -20.0), (-1.0, -60.0)])
+    points, edges, fingers = {}, {}, {}
+    for name, way, inner in (("left", -1.0, 12.0), ("right", 1.0, 12.0)):
+        fingers[name] = FingerModel()
+        for k, (x, z) in enumerate(outline):
+            xyz_m = (1e-3 * way * (inner + x), 0.0, 1e-3 * z)
+            points[f"{name}{k}"] = PointModel(finger=name, xyz_m=xyz_m, corner=0 < k < 4)
+        for k in range(4):
+            edges[f"{name}{k}"] = EdgeModel(start=f"{name}{k}", end=f"{name}{k + 1}")
+    file = Gripper(GripperModel(name="outline", fingers=fingers, points=points, edges=edges, tilt_sigma_rad=sigma_rad))
+    settings = MonitorSettings()
+    tracker = Tracker(make_camera(PAPER_LENS), file, settings)
+    assert tracker.along.tolist() == [True, False, True, True] * 2
+    possible = Possible(tracker, file, settings, FILE_T)
+    hypotheses = possible.hypotheses(np.arange(len(edges)))
+    assert hypotheses.across.tolist() == [False, True, sigma_rad > 0.0, False] * 2

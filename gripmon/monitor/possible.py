@@ -20,7 +20,7 @@ from gripmon.monitor.refits import Known, Refits
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReference, Bounds, digest_of
 from gripmon.monitor.tracker import Tracker
-from gripmon.track.edges import Measurement, inner_edges, sides
+from gripmon.track.edges import Measurement, inner_edges, receding, sides
 from gripmon.track.edges.words import in_words
 from gripmon.track.integrity import Hypotheses, hypotheses_of
 
@@ -46,7 +46,7 @@ class Possible:
 
     def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, cam_T_grip: Array):
         """``cam_T_grip`` (4, 4): where the picture shows the gripper, for its edges' names in words."""
-        self._gripper, self._along, self._sides = gripper, tracker.along, sides(gripper)
+        self._gripper, self._along, self._sides = gripper, tracker.along & ~receding(gripper), sides(gripper)
         self._words, self._inner = in_words(gripper, cam_T_grip), inner_edges(gripper)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is configured as exact
         self._kept: dict[bytes, About] = {}

@@ -29,7 +29,9 @@ from gripmon.track.edges import Measurement, own_steps
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
-"""Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
+"""Frames between two checks of the fingers' ends, while the gripper is where it was, the last check proved it, and the
+strips show it in each; without strips, what speaks against the ends counts in each.
+"""
 
 
 FADED_RATIO, FADED_WITHIN_S = 0.7, 0.25
@@ -241,12 +243,15 @@ class Integrity:
         displaced = weigher.displaced(measurement, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen or displaced or not self._place.proved
         self._frames += 1
-        if not due:
-            trust = weigher.weigh(measurement, cam_T_grip, None, now_s)
-            if not self._past_limit(trust.bounds):
-                return trust
+        unlooked = None if due else weigher.weigh(measurement, cam_T_grip, None, now_s)
+        if unlooked is not None and self._past_limit(unlooked.bounds):
+            unlooked = None
+        if unlooked is not None and along.here:
+            return unlooked
         ends = self._tracker.ends(frame, measurement)
         trust = weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
+        if unlooked is not None and not self._past_limit(trust.bounds):
+            return unlooked  # nothing speaks against them, and what proves the place counts in every fourth
         self._ends_seen = trust.proven
         return trust
 
@@ -408,7 +413,7 @@ class Integrity:
         """Whether the gripper's look is seen at a pose (4, 4)."""
         if not self._look.ready or frame.image is None:
             return False
-        return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_ODDS)
+        return self._look.supports(frame.image, cam_T_grip, measurement.jaw_opening_m, LOOK_ODDS)
 
 
 def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:

@@ -5,7 +5,7 @@ from gripmon.track.edges.evidence import FingerMeter, agreeing_fingers, edge_res
 from gripmon.track.edges.measure import FingertipMeter, Patience, Sought
 from gripmon.track.edges.readout import edge_sums, trace_of
 from gripmon.track.edges.robust_fit import VAGUE_M, VAGUE_RAD, NormalEquations, prior_information
-from gripmon.track.edges.roles import has_lone_end, inner_edges, sides
+from gripmon.track.edges.roles import has_lone_end, inner_edges, receding, sides
 from gripmon.track.edges.settings import MeasurementSettings, SearchSettings
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Expected, Measurement
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
@@ -37,6 +37,7 @@ __all__ = [
     "inner_edges",
     "own_steps",
     "prior_information",
+    "receding",
     "sides",
     "trace_of",
     "warm_up_fit",

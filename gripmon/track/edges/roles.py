@@ -38,6 +38,21 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
     return np.zeros(3), np.ones(len(length), dtype=bool)
 
 
+def receding(gripper: Gripper) -> NDArray[np.bool_]:
+    """(e,) which edges of a file from images run along its fingers in its plane, but belong to an end: that of a thick
+    finger recedes from the camera.  They lie between an edge across the finger and a longer one along it.
+    """
+    along, points = along_fingers(gripper)[1], gripper.edge_points
+    if not gripper.model.tilt_sigma_rad:
+        return np.zeros_like(along)
+    points_m = gripper.points_grip_m()
+    length_m = np.linalg.norm(points_m[points[:, 1]] - points_m[points[:, 0]], axis=1)
+    meets = (points[:, :, None, None] == points).any(axis=3)  # (e, 2, e) at its one point, and at its other
+    crossed = (meets & ~along).any(axis=2)
+    goes_on = (meets & along & (length_m > length_m[:, None, None])).any(axis=2)
+    return np.asarray(along & (crossed & ~goes_on & goes_on[:, ::-1]).any(axis=1))
+
+
 def has_lone_end(gripper: Gripper) -> bool:
     """Whether the gripper has a single finger, whose end alone shows a motion along it."""
     return len(gripper.finger_ids) == 1 and not along_fingers(gripper)[1].all()
