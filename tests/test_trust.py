@@ -371,20 +371,6 @@ def test_ends_that_proved_nothing_are_looked_at_in_every_frame(monkeypatch: pyte
     assert len(proved) <= BEGINS / 4 and set(range(max(proved) + 4, BEGINS + 6)) <= set(looked)
 
 
-def test_ends_are_looked_at_in_every_frame_in_which_no_strips_show_the_place(monkeypatch: pytest.MonkeyPatch):
-    """What stands in for them may appear in any frame."""
-    ends, looked = Tracker.ends, []
-
-    def counted(tracker: Tracker, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
-        looked.append(frame.seq)
-        return ends(tracker, frame, measurement)
-
-    monkeypatch.setattr(Tracker, "ends", counted)
-    monkeypatch.setattr(Integrity, "_along", lambda *_, **__: StripsSeen())
-    watched(scene(BEGINS))
-    assert set(looked) == set(range(BEGINS))
-
-
 def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_than_they_exclude():
     """Each excludes nine of ten, and one in 1e5 is asked for: a knock that has happened in 1e-3 of such times."""
     monitor = new_monitor(MonitorSettings(policy=PolicySettings(mount_jumps_per_month=1.0, integrity_risk=1e-5)))

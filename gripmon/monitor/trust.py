@@ -29,9 +29,7 @@ from gripmon.track.edges import Measurement, own_steps
 from gripmon.track.look import ONE_EDGE_PX, FingerStrips, GripperLook, StripsRefused, StripsSeen
 
 PROOF_EVERY_FRAMES = 4
-"""Frames between two checks of the fingers' ends, while the gripper is where it was, the last check proved it, and the
-strips show it in each; without strips, what speaks against the ends counts in each.
-"""
+"""Frames between two checks of the fingers' ends, while the gripper is where it was and the last check proved it."""
 
 
 FADED_RATIO, FADED_WITHIN_S = 0.7, 0.25
@@ -243,15 +241,12 @@ class Integrity:
         displaced = weigher.displaced(measurement, now_s)
         due = self._frames % PROOF_EVERY_FRAMES == 0 or not self._ends_seen or displaced or not self._place.proved
         self._frames += 1
-        unlooked = None if due else weigher.weigh(measurement, cam_T_grip, None, now_s)
-        if unlooked is not None and self._past_limit(unlooked.bounds):
-            unlooked = None
-        if unlooked is not None and along.here:
-            return unlooked
+        if not due:
+            trust = weigher.weigh(measurement, cam_T_grip, None, now_s)
+            if not self._past_limit(trust.bounds):
+                return trust
         ends = self._tracker.ends(frame, measurement)
         trust = weigher.weigh(measurement, cam_T_grip, ends, now_s, seen_along=along.here)
-        if unlooked is not None and not self._past_limit(trust.bounds):
-            return unlooked  # nothing speaks against them, and what proves the place counts in every fourth
         self._ends_seen = trust.proven
         return trust
 
