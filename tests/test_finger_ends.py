@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -16,7 +17,7 @@ from support.simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario,
 
 from gripmon.daemon.config import read_gripper
 from gripmon.model.gripper import Gripper
-from gripmon.monitor.ends import proof
+from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof
 from gripmon.simulate import Scenario, make_scenario, paper_rig
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 from gripmon.track.edges import FingerEndsSeen, Measurement, MeasurementSettings
@@ -123,6 +124,22 @@ def test_a_pose_that_slid_along_the_fingers_is_not_proven(scenario: Scenario, sl
     found, ends = looked_at(scenario, slide_m)
     assert found.trusted and abs(slide_of(found)) > 2.5e-3, "measured there, or nearly"
     assert not ends.sure and ends.seen.max() < 2
+
+
+@pytest.mark.parametrize("mirror_m", [7.5e-4, 1.5e-3])
+def test_ends_in_a_mirror_are_none_since_sides_of_the_fingers_go_on_beyond_them(mirror_m: float):
+    """The tips' image in a glossy table lies where a knock along the fingers has taken the tips away from."""
+    mirror = Prop(shape="mirrored_fingers", centre_m=(0.0, 0.0, mirror_m))
+    gripper = box_gripper(sharp=False)
+    evidence = EndsEvidence(gripper, along_fingers(gripper)[1])
+    found, ends = looked_at(plain_scenario(props=(mirror,)), 2.0 * mirror_m)
+    assert slide_of(found) == pytest.approx(2.0 * mirror_m, abs=2e-4)
+    assert ends.longer == {0, 1} and ends.seen.min() == 0 and ends.seen.sum() <= 1
+    assert evidence.misread(found, ends) == 1.0
+    assert evidence.misread(found, replace(ends, longer=frozenset())) == pytest.approx(MISREAD_PROBABILITY**2)
+    # A finger that shows a corner isn't doubted for what goes on beside it.
+    cornered = replace(ends, seen=np.array([2, 2]), strictly=np.array([2, 2]))
+    assert evidence.misread(found, cornered) == pytest.approx(MISREAD_PROBABILITY**4)
 
 
 @pytest.mark.parametrize("gain", [0.7, 2.0])

@@ -44,12 +44,15 @@ class EndsEvidence:
         whichever fingers, where no corner is seen: a single straight border may show them all.  An edge that goes on
         beyond a finger that shows no corner is such a border, whatever corner another finger makes with it.  A finger
         counts once less where something goes on by a few pixels beyond each of its corners: that is what a slide by a
-        few pixels looks like.
+        few pixels looks like; so does one that shows no corner and of which a side goes on beyond its end, and its
+        edges don't count: what is taken for its end lies on something longer.
         """
         edges = self._across(measurement)
         edges = edges[self._at_ends[edges]]
+        longer = [] if ends is None else [finger for finger in ends.longer if not ends.seen[finger]]
         if ends is not None:
             edges = edges[~np.isin(edges, list(ends.past)) | (ends.seen[self._finger[edges]] > 0)]
+            edges = edges[~np.isin(self._finger[edges], longer)]
         if kept is not None:
             edges = edges[np.isin(edges, measurement.normal.edge[kept])]
         times = self._times(edges, ends)
@@ -58,7 +61,7 @@ class EndsEvidence:
                 times = min(times, 1)
             fingers = list(set(self._finger[edges].tolist()))
             times -= int(np.count_nonzero((ends.seen[fingers] > 0) & (ends.strictly[fingers] == 0)))
-        return MISREAD_PROBABILITY ** max(times, 0)
+        return MISREAD_PROBABILITY ** max(times - len(longer), 0)
 
     def sides_misread(self, measurement: Measurement) -> float:
         """Probability that all sides of fingers that are seen are something else, each as probably as an end."""

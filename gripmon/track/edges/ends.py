@@ -49,13 +49,14 @@ class FingerEndsSeen:
     """(f,) corners at the end of each finger, or places where its sides turn into a curve: ``seen`` with nothing that
     goes on beyond them, and those that ``might`` be seen in this view; ``strictly`` those seen beyond which nothing
     goes on by a few pixels either, as beyond a step on the finger; clutter does, too.  ``past``: the edges at the ends
-    that go on beyond one of their corners.
+    that go on beyond one of their corners; ``longer``: the fingers of which a side does.
     """
 
     seen: NDArray[np.intp]
     might: NDArray[np.intp]
     strictly: NDArray[np.intp]
     past: frozenset[int] = frozenset()
+    longer: frozenset[int] = frozenset()
 
     @property
     def sure(self) -> bool:
@@ -162,10 +163,10 @@ class FingerEnds:
     def seen(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
         """How many of each finger's ends are seen; takes a quarter of a measurement's time."""
         fingers = len(self._gripper.finger_ids)
-        places, strictly, past = self._at_places(image, measurement)
+        places, strictly, past, longer = self._at_places(image, measurement)
         asked = places, self.in_view(measurement.prediction), strictly
         seen, might, of_these = (np.bincount(self.finger[each], minlength=fingers) for each in asked)
-        return FingerEndsSeen(seen, might, of_these, past)
+        return FingerEndsSeen(seen, might, of_these, past, longer)
 
     def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
         """(s,) the places that might be seen as ends in this view."""
@@ -176,9 +177,9 @@ class FingerEnds:
 
     def _at_places(
         self, image: Image, measurement: Measurement
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], frozenset[int]]:
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], frozenset[int], frozenset[int]]:
         """(s,) the measured places that are ends: no edge goes on beyond them; (s,) those that are strictly.  And which
-        edges across go on.
+        edges across go on, and the fingers of which a side does.
         """
         prediction, places = measurement.prediction, self._places
         if self._kept is None or self._kept[0] is not prediction:
@@ -194,14 +195,15 @@ class FingerEnds:
             seen = all(consensus.edge_seen[edge[stretch[0]]] for stretch in stretches)
             measured[number] = seen and (shown >= SHOWN_BESIDE * usual).all()
         if not len(probes.place) or not measured.any():
-            return measured, measured, frozenset()
+            return measured, measured, frozenset(), frozenset()
         goes_on, by_a_few_px = self._going_on(image, measurement, probes)
         extended = edge[probes.sample]
         past = frozenset(extended[goes_on & ~self.along[extended]].tolist())
+        longer = frozenset(self.finger[probes.place[goes_on & self.along[extended]]].tolist())
         measured[probes.place[goes_on]] = False
         strictly = measured.copy()
         strictly[probes.place[by_a_few_px]] = False
-        return measured, strictly, past
+        return measured, strictly, past, longer
 
     def _going_on(
         self, image: Image, measurement: Measurement, probes: _Probes
