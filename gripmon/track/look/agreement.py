@@ -63,8 +63,11 @@ class LookAgreement:
     log_odds: Array
 
     def supports(self, risk: float, pose: int = 0) -> bool:
-        """Whether the gripper's look is seen at a pose, by chance with no more than a probability of ``risk``."""
-        return float(self.log_odds[pose].sum()) > -math.log(risk)
+        """Whether the gripper's look is seen at a pose, rather than nowhere or at another one of the poses, by chance
+        with no more than a probability of ``risk``.
+        """
+        odds = self.log_odds.sum(axis=1)
+        return bool(odds[pose] - np.delete(odds, pose).max(initial=0.0) > -math.log(risk))
 
     def contradicts(self, risk: float, pose: int = 0) -> bool:
         """Whether the look is seen at another one of the poses, and so much less at this one that it can't be here.

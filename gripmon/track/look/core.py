@@ -195,13 +195,10 @@ class GripperLook:
         return out
 
     def supports(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> bool:
-        """Whether the look is seen at a pose (4, 4) rather than elsewhere, or at any of the slides along the fingers,
-        by chance with no more than a probability of ``risk``.
-        """
+        """:meth:`LookAgreement.supports` for a pose (4, 4), beside all of the slides along the fingers."""
         poses = np.stack([cam_T_grip] * (1 + len(self._slides_grip_m)))
         poses[1:, :3, 3] += self._slides_grip_m @ cam_T_grip[:3, :3].T
-        here, *slid = self.compare(image, poses, jaw_opening_m).log_odds.sum(axis=1).tolist()
-        return bool(here - max(0.0, *slid) > -math.log(risk))
+        return self.compare(image, poses, jaw_opening_m).supports(risk)
 
     def _begin(self, layout: Layout) -> None:
         own = ~layout.guard
