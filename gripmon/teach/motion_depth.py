@@ -119,7 +119,7 @@ def _as_they_move(
     the plane of its sides, is assumed.  Unless a calibration's axes are to be kept (``keep``), the TCP moves with the
     tips, and x is as the jaws move, square to the fingers: which of the tips' vertices face each other tells less.
     """
-    points = [np.column_stack([f.xy, np.ones(len(f.xy))]) / q[:, None] for f, q in zip(fingers, found.q, strict=True)]
+    points = _in_space(fingers, found)
     points = [np.where(np.isfinite(old), new, np.nan) for old, new in zip(placed.points, points, strict=True)]
     tcp = placed.tcp
     if _beside_px(camera, placed, points, found) >= WORST_OUTLINE_PX:
@@ -141,6 +141,11 @@ def _as_they_move(
     depth = float(tcp[2])
     placed = replace(placed, points=tuple(own / depth for own in placed.points), tcp=tcp / depth)
     return replace(placed, rotation=rotation, sigma_rad=sigma), found.over(depth)
+
+
+def _in_space(fingers: Sequence[Outline], found: JawMotion) -> list[Array]:
+    """Vertices (v, 3) of each finger at the depths of a motion."""
+    return [np.column_stack([f.xy, np.ones(len(f.xy))]) / q[:, None] for f, q in zip(fingers, found.q, strict=True)]
 
 
 def _beside_px(camera: Camera, placed: PlacedOutlines, points: Sequence[Array], found: JawMotion) -> float:
@@ -169,7 +174,7 @@ def place_by_motion(
     """
     if found.slope_sigma.max() > FLAT_SIGMA_RAD:
         raise Unfit("it leaves the fingers' tilt unknown")
-    points = [np.column_stack([f.xy, np.ones(len(f.xy))]) / q[:, None] for f, q in zip(fingers, found.q, strict=True)]
+    points = _in_space(fingers, found)
     if pose is not None:
         rotation, tcp = pose
         # Unless the travel tells, the outermost point lies as far out as the TCP.
