@@ -54,9 +54,9 @@ class UnclearPartsError(NoResultError):
     (k, 2) of their outlines that don't show; ``image``: number of the first image that shows them there.
     """
 
-    def __init__(self, text: str, parts: list[Bits], still: Bits, unseen_px: Sequence[Array] = ()):
+    def __init__(self, text: str, parts: list[Bits], still: Bits, unseen_px: Sequence[Array] = (), image: int = 0):
         super().__init__(text)
-        self.parts, self.still, self.unseen_px, self.image = parts, still, unseen_px, 0
+        self.parts, self.still, self.unseen_px, self.image = parts, still, unseen_px, image
 
     def picture(self, shown: Image) -> Image:
         """The image (h, w[, 3]) with what stays (blue), what may be a finger (green, numbered), and what of its outline

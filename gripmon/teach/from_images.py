@@ -159,6 +159,7 @@ def gripper_from_images(
             "each before another background that is brighter or darker than the fingers",
             [finger.mask for finger in seen.fingers],
             seen.matte.still,
+            image=groups[first][0],
         )
     rms = np.concatenate([chain.rms_px for finger in seen.fingers for chain in finger.chains])
     used = len(seen.matte.kept)
