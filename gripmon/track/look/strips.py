@@ -32,10 +32,8 @@ lost gripper is searched for, 12 mm at 8 px to the millimetre.
 STRIP_LINES = 3
 """Side by side behind each end edge: something partly in front of a finger hides some of them."""
 
-SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
-"""Filter along the strips, so that a shift by a tenth of a millimetre does no harm; and length of the mean that is
-subtracted, px: light that falls off along the finger says nothing.
-"""
+SLOPE_PX = 15
+"""Length of the mean along the strips that is subtracted, px: light that falls off along the finger says nothing."""
 
 FILTERED_PX = SLOPE_PX // 2 + 1
 """Beside a strip that what is smooth and what changes slowly on it are taken from."""
@@ -152,7 +150,7 @@ class FingerStrips:
             return
         strips, within = self._read(self._layout, image, cam_T_grip, jaw_opening_m), self._layout.within
         self._learnt_s = now_s
-        if self.frames >= FIRST_FRAMES and self._alike_here(self._layout, strips) < LIKE_CORRELATION:
+        if self.frames >= FIRST_FRAMES and self._alike(self._layout, strips, 0)[0] < LIKE_CORRELATION:
             self._unlike += 1
             if self._unlike < MOST_FRAMES:
                 return
@@ -162,7 +160,7 @@ class FingerStrips:
         self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
         self._prepare(self._layout)
         farther = self._read(self._layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
-        usual = self._alike(self._layout, farther)
+        usual = self._alike(self._layout, farther, REACH_PX)
         self._usual += (usual - self._usual) / min(self.frames, MOST_FRAMES)
         self._know_farther()
 
@@ -207,13 +205,13 @@ class FingerStrips:
         # Read farther at once where that was needed the last time: mostly it is again.
         beyond = self._beyond if alone else REACH_PX
         strips = self._read(layout, image, cam_T_grip, jaw_opening_m, beyond)
-        explained = alone and self._alike_here(layout, strips[:, beyond : beyond + LENGTH_PX]) >= most_alike
+        explained = alone and self._alike(layout, strips, 0)[0] >= most_alike
         self._beyond = 0 if explained else REACH_PX
         if explained:
             return StripsSeen(here=True)  # usually: no slide could be better
         if beyond == 0:
             strips = self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
-        unexplained = _unexplained(self._alike(layout, strips), most_alike)
+        unexplained = _unexplained(self._alike(layout, strips, REACH_PX), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = float(unexplained.min())
@@ -232,19 +230,11 @@ class FingerStrips:
         as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= rival
         return StripsSeen(here=confirmed, undecided=not alone and independent >= FEWEST_POINTS and as_well)
 
-    def _alike_here(self, layout: _Layout, strips: NDArray[np.float32]) -> float:
-        """Correlation of strips, as read at a pose, with what was learnt; gain and brightness are free, as light is."""
-        there = np.clip(strips, -self._most, self._most) * layout.within
-        return float((there * self._learnt).sum()) / math.sqrt(float(np.square(there).sum()) * self._own + 1e-12)
-
-    def _alike(self, layout: _Layout, strips: NDArray[np.float32]) -> Array:
-        """(2 REACH_PX + 1,) correlations with what was learnt, of strips read so far beyond, slid along from there."""
-        strips = np.clip(strips, -self._most, self._most)
-        energy = cv2.matchTemplate(np.square(strips), layout.within, cv2.TM_CCORR).ravel()
-        product = cv2.matchTemplate(strips, self._learnt, cv2.TM_CCORR).ravel()
-        # Where the strips leave the image nothing would differ; sums by Fourier transforms may be less than nothing.
-        least = max(0.25 * float(energy[REACH_PX]), 0.0)
-        return np.asarray(product / np.sqrt(np.maximum(energy, least) * self._own + 1e-12))
+    def _alike(self, layout: _Layout, strips: NDArray[np.float32], reach: int) -> Array:
+        """(2 reach + 1,) correlations with what was learnt, of strips as read, slid along from there; gain and
+        brightness are free, as light is.
+        """
+        return _correlations(strips, self._learnt, layout.within, self._most, self._own, reach)
 
     def _know_farther(self) -> None:
         """What a comparison needs of the usual correlations."""
@@ -279,11 +269,7 @@ class FingerStrips:
             if kept.jacobian.any():  # from a pose at which nothing projects nothing can be followed
                 self._places[beyond] = kept
         values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-        if values.ndim == 3:
-            values = values @ GREY_BGR
-        smooth = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
-        fast = smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(fast[:, FILTERED_PX:-FILTERED_PX], dtype=np.float32)
+        return _fast_changes(values if values.ndim == 2 else values @ GREY_BGR)
 
     def _project(self, layout: _Layout, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int) -> _Places:
         node, _ = _nodes(LENGTH_PX + 2 * (FILTERED_PX + beyond))
@@ -412,6 +398,57 @@ def _followed(
     return place[0], place[1], largest
 
 
+@compiled
+def _fast_changes(values: Any) -> NDArray[np.float32]:
+    """(n, w - 2 FILTERED_PX) of grey levels (n, w): smoothed by a quarter of each neighbour, so that a shift by a tenth
+    of a millimetre does no harm, less their mean over SLOPE_PX.
+    """
+    count, width = values.shape
+    out, smooth = np.empty((count, width - 2 * FILTERED_PX), np.float32), np.zeros(width)
+    for n in range(count):
+        for x in range(1, width - 1):
+            smooth[x] = 0.25 * values[n, x - 1] + 0.5 * values[n, x] + 0.25 * values[n, x + 1]
+        total = 0.0
+        for x in range(1, SLOPE_PX):
+            total += smooth[x]
+        for x in range(width - 2 * FILTERED_PX):
+            total += smooth[x + SLOPE_PX]
+            out[n, x] = smooth[x + FILTERED_PX] - total / SLOPE_PX
+            total -= smooth[x + 1]
+    return out
+
+
+@compiled
+def _correlations(strips: Any, learnt: Any, within: Any, most: float, own: float, reach: int) -> Array:
+    """(2 reach + 1,) correlations of ``learnt`` strips (n, l), zero but ``within``, whose squares sum to ``own``, with
+    what ``strips`` (n, w), no farther than ``most`` from zero, show at each slide from their middle.
+    """
+    (count, length), slides = learnt.shape, 2 * reach + 1
+    width, first = length + 2 * reach, (strips.shape[1] - length) // 2 - reach
+    product, energy, out = np.zeros(slides, np.float32), np.zeros(slides), np.empty(slides)
+    row, squares = np.empty(width, np.float32), np.zeros(width + 1)
+    for n in range(count):
+        for x in range(width):
+            row[x] = min(max(strips[n, first + x], -most), most)
+            squares[x + 1] = squares[x] + row[x] * row[x]
+        begin = 0
+        for x in range(length + 1):
+            if x < length and within[n, x] > 0.0:
+                weight, shown = learnt[n, x], row[x:]
+                for s in range(slides):  # each of its own, so that they are added side by side
+                    product[s] += weight * shown[s]
+                continue
+            if x > begin:
+                for s in range(slides):
+                    energy[s] += squares[x + s] - squares[begin + s]
+            begin = x + 1
+    # Where the strips leave the image nothing would differ.
+    least = 0.25 * energy[reach]
+    for s in range(slides):
+        out[s] = product[s] / math.sqrt(max(energy[s], least) * own + 1e-12)
+    return out
+
+
 def _farther_on(alike: Array) -> Array:
     """Correlations at each slide, zero from the place itself to where they are first no longer alike: what is left is
     of something else that looks alike.
@@ -439,3 +476,5 @@ def _nodes(width: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
 def warm_up() -> None:
     """Compile what a frame needs, or load what was compiled."""
     _followed(np.zeros((1, 2)), np.zeros((1, 2, 7)), np.eye(4), np.eye(4), 0.0, np.ones((1, 1), np.float32))
+    strips = _fast_changes(np.zeros((1, LENGTH_PX + 2 * FILTERED_PX), np.float32))
+    _correlations(strips, strips, strips, 1.0, 1.0, 0)
