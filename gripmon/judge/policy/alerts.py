@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import enum
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -81,38 +82,47 @@ class AlertBook:
         return None if entry is None else entry.alert
 
     def present(
-        self, topic: str, alert: Alert, now_s: float, stamp_ns: int, *, news: bool = False
+        self,
+        topic: str,
+        alert: Alert,
+        now_s: float,
+        stamp_ns: int,
+        *,
+        news: bool = False,
+        text: Callable[[], str] | None = None,
     ) -> tuple[Alert, ...]:
         """The condition holds, as ``alert`` says now; returns the events to publish: one or none.
 
         ``news``: the text alone says something new to a person; else only another cause, severity or size does.
+        ``text``: makes the alert's text, which is asked for where it is published alone.
         """
         entry = self._open.get(topic)
         if entry is None:
             self._raised += 1
-            raised = msgspec.structs.replace(
-                alert, event=AlertEvent.RAISED, alert_id=self._new_id(topic, stamp_ns), since_ns=stamp_ns
-            )
-            self._keep(topic, raised, now_s)
-            return (raised,)
-        known = entry.alert
-        if alert.cause is Cause.UNKNOWN:  # a doubt later on takes nothing back
-            alert = msgspec.structs.replace(alert, cause=known.cause, part=known.part, causes=known.causes)
-        updated = msgspec.structs.replace(
+            event, alert_id, since_ns, acknowledged = AlertEvent.RAISED, self._new_id(topic, stamp_ns), stamp_ns, False
+        else:
+            known = entry.alert
+            explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
+            if alert.cause is Cause.UNKNOWN:  # a doubt later on takes nothing back
+                alert = msgspec.structs.replace(alert, cause=known.cause, part=known.part, causes=known.causes)
+            worse = alert.severity.rank > known.severity.rank
+            due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
+            if not (worse or (due and (news or _differ(known, alert)))):
+                if entry.absent_since_s is not None:
+                    self._open[topic] = replace(entry, absent_since_s=None)
+                return ()
+            event, alert_id, since_ns = AlertEvent.UPDATED, known.alert_id, known.since_ns
+            acknowledged = known.acknowledged and not worse
+        told = msgspec.structs.replace(
             alert,
-            event=AlertEvent.UPDATED,
-            alert_id=known.alert_id,
-            since_ns=known.since_ns,
-            acknowledged=known.acknowledged and alert.severity.rank <= known.severity.rank,
+            text=alert.text if text is None else text(),
+            event=event,
+            alert_id=alert_id,
+            since_ns=since_ns,
+            acknowledged=acknowledged,
         )
-        worse = alert.severity.rank > known.severity.rank
-        explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
-        due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
-        if worse or (due and (news or _differ(known, updated))):
-            self._keep(topic, updated, now_s)
-            return (updated,)
-        self._open[topic] = replace(entry, absent_since_s=None)
-        return ()
+        self._keep(topic, told, now_s)
+        return (told,)
 
     def absent(self, topic: str, text: str, now_s: float, *, at_once: bool = False) -> tuple[Alert, ...]:
         """The condition doesn't hold: its alert is cleared when it hasn't for long enough, or ``at_once``."""

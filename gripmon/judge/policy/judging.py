@@ -334,7 +334,10 @@ class Policy:
         alerts += book.absent(Topic.IMAGE, "images are good again", now_s)
         # A fault of the gripper or the lens has one alert, about that.
         if moved and (not not_the_camera or book.about(Topic.MOTION) is not None):
-            alerts += book.present(Topic.MOTION, self._motion_alert(evidence, stamp_ns), now_s, stamp_ns)
+            alert = self._motion_alert(evidence)
+            alerts += book.present(
+                Topic.MOTION, alert, now_s, stamp_ns, text=lambda: _motion_text(alert, evidence, stamp_ns)
+            )
         else:
             alerts += book.absent(Topic.MOTION, "the camera is where the reference has it", now_s)
         vibration = motion.vibration
@@ -342,8 +345,8 @@ class Policy:
             size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
             text = f"the camera vibrates: TCP {size_mm:.3f} mm rms{frequency_text(hertz)}"
             severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(Topic.VIBRATION))
-            alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
-            alerts += book.present(Topic.VIBRATION, alert, now_s, stamp_ns)
+            vibrates = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
+            alerts += book.present(Topic.VIBRATION, vibrates, now_s, stamp_ns)
         else:
             alerts += book.absent(Topic.VIBRATION, "the camera no longer vibrates", now_s)
         if evidence.d_m <= self._settings.limit_m and evidence.delta_rad <= self._settings.limit_rad:
@@ -359,7 +362,8 @@ class Policy:
             alerts += book.absent(Topic.GRIPPER, "fingers, jaw and lens are as they should be", now_s)
         return alerts
 
-    def _motion_alert(self, evidence: Evidence, stamp_ns: int) -> Alert:
+    def _motion_alert(self, evidence: Evidence) -> Alert:
+        """All of it but the text, which is composed where it is published: a motion lasts for many frames."""
         settings, motion, explanation = self._settings, evidence.motion, evidence.explanation
         shift_m, turn_rad = float(np.linalg.norm(motion.shift[:3])), float(np.linalg.norm(motion.shift[3:]))
         past_warning = max(shift_m / settings.warn_m, turn_rad / settings.warn_rad)
@@ -369,12 +373,11 @@ class Policy:
             rate = motion.creep.rate_m_per_min
             left_s = time_left_s(motion.shift, motion.creep.velocity, settings.limit_m, settings.limit_rad)
         x, y, z = motion.shift[:3].tolist()
-        parts = [motion_text(motion, evidence.since_first, stamp_ns), creep_text(rate, left_s), explanation.text]
         return Alert(
             kind=motion.kind,
             cause=explanation.confirmed_cause.cause,
             severity=_severity(past_warning, past_limit, self.alerts.about(Topic.MOTION)),
-            text="; ".join(part for part in parts if part),
+            text="",
             part=explanation.confirmed_cause.part,
             causes=explanation.causes,
             tcp_shift_m=(x, y, z),
@@ -382,6 +385,12 @@ class Policy:
             rate_m_per_min=rate,
             time_left_s=left_s,
         )
+
+
+def _motion_text(alert: Alert, evidence: Evidence, stamp_ns: int) -> str:
+    moved = motion_text(evidence.motion, evidence.since_first, stamp_ns)
+    parts = [moved, creep_text(alert.rate_m_per_min, alert.time_left_s), evidence.explanation.text]
+    return "; ".join(part for part in parts if part)
 
 
 def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
