@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.policy_runs import (
@@ -273,5 +271,5 @@ def test_a_camera_that_swings_has_moved_by_more_than_three_standard_deviations(
     """A swing of 0.1 mm and 1 mrad along one other axis: it is the way's length that counts."""
     evidence = seen(shift_mm, turn_rad=turn_rad)
     swing = np.array([0.0, 1e-8, 0.0, 1e-6, 0.0, 0.0])
-    assert evidence.moved and replace(evidence, swing=swing).moved is moved
-    assert not replace(seen(9.0, present=False), swing=swing).moved
+    assert evidence.moved and evidence._replace(swing=swing).moved is moved
+    assert not seen(9.0, present=False)._replace(swing=swing).moved

@@ -6,7 +6,7 @@ Whatever happens, no frame is valid, nor any bound stated, that the truth is bey
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import msgspec
@@ -347,7 +347,7 @@ def test_edges_of_both_ends_on_one_line_count_once_without_a_corner():
     assert measurement is not None and weigher.place.anchor is not None
     normal, names, along = measurement.normal, box_gripper(sharp=False).edge_ids, monitor._tracker.along
     near = np.array([along[edge] or names[edge] in ("L_tip_near", "R_tip_near") for edge in normal.edge])
-    on_one_line = replace(normal, **{part.name: getattr(normal, part.name)[near] for part in fields(normal)})
+    on_one_line = type(normal)(*(part[near] for part in normal))
     limit_m, at_s = PolicySettings().alert_limit_m, weigher.place.anchor.now_s
     for sides_and, corners, times in ((on_one_line, (0, 0), 1), (on_one_line, (1, 0), 2), (normal, (0, 0), 2)):
         ends, seen = FingerEndsSeen(*map(np.array, (corners, [3, 3], corners))), replace(measurement, normal=sides_and)
@@ -380,7 +380,7 @@ def test_two_sides_hold_the_old_place_for_as_long_as_a_knock_is_not_likelier_tha
     assert measurement is not None and weigher.place.anchor is not None
     seen, along = measurement.consensus.edge_seen, monitor._tracker.along
     sides = np.flatnonzero(seen & along)[:2]
-    of_two = replace(measurement, normal=replace(measurement.normal, edge=sides))
+    of_two = replace(measurement, normal=measurement.normal._replace(edge=sides))
     month_s = 365.25 / 12 * 86400.0
     assert weigher.held_across(of_two, weigher.place.anchor.now_s + 0.9e-3 * month_s)
     assert not weigher.held_across(of_two, weigher.place.anchor.now_s + 1.1e-3 * month_s)
@@ -433,8 +433,8 @@ def test_a_bent_finger_makes_no_frame_worse_than_its_bound(tip_shift_m: tuple[fl
 def test_one_frame_is_no_knock_nor_are_two_with_the_old_place_between_them():
     trust = new_monitor()._trust
     seen = Trust(Protection(0.0, 0.0, 1e-5), proven=True, displaced=True)
-    at_home, explained = replace(seen, displaced=False), replace(seen, ambiguous=True)
-    assert not trust._knocked(seen, 10.0, False) and not trust._knocked(replace(seen, proven=False), 10.0, False)
+    at_home, explained = seen._replace(displaced=False), seen._replace(ambiguous=True)
+    assert not trust._knocked(seen, 10.0, False) and not trust._knocked(seen._replace(proven=False), 10.0, False)
     assert trust._knocked(seen, 10.0, False), "seen there before"
     for between in (at_home, explained):
         assert not trust._knocked(between, 0.0, False) and not trust._knocked(seen, 10.0, False)
@@ -444,7 +444,7 @@ def test_one_frame_is_no_knock_nor_are_two_with_the_old_place_between_them():
 
 def test_one_frame_is_a_knock_where_the_ends_and_what_the_fingers_show_along_themselves_agree():
     seen = Trust(Protection(0.0, 0.0, 1e-5), proven=True, displaced=True)
-    for trust, knocked in ((seen, True), (replace(seen, proven=False), False), (replace(seen, ambiguous=True), False)):
+    for trust, knocked in ((seen, True), (seen._replace(proven=False), False), (seen._replace(ambiguous=True), False)):
         assert new_monitor()._trust._knocked(trust, 10.0, seen_along=True) == knocked
 
 

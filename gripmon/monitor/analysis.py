@@ -242,7 +242,7 @@ class FrameAnalysis:
         assert frame.image is not None
         if self.stream.repeats or not self._repeats.add(frame.image, standing.measurement, self.stream.coded, now_s):
             return standing
-        return replace(standing, believed=False, old=True)
+        return standing._replace(believed=False, old=True)
 
     def evidence(
         self,

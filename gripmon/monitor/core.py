@@ -277,10 +277,10 @@ class Monitor:
         """Suspect until a frame shows whether the picture fits the reference; then an alert reports which."""
         if evidence.motion.frames == 0 or not evidence.believed:
             reason = "restarted, and too few frames since to say whether the picture fits the reference"
-            return replace(judgement, verdict=Verdict.SUSPECT, reason=reason)
+            return judgement._replace(verdict=Verdict.SUSPECT, reason=reason)
         self._restarted = False
         compared = after_restart(self.reference, evidence, self._settings.policy.warn_m)
-        return replace(judgement, alerts=(compared, *judgement.alerts))
+        return judgement._replace(alerts=(compared, *judgement.alerts))
 
     def _follow(self, standing: Standing, motion: Motion) -> None:
         """The measured pose is believed: update the averages and what is learnt."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from gripmon.model.records import Array, ReferenceRecord
@@ -11,8 +10,7 @@ from gripmon.monitor.since import Bounds
 from gripmon.track.edges import FingerEndsSeen, Measurement
 
 
-@dataclass(frozen=True, slots=True)
-class Trust:
+class Trust(NamedTuple):
     """How far one measurement can be trusted.
 
     ``bounds``: of the pose in question.  ``proven``: the fingers' ends are seen as ends, or aren't needed.
@@ -48,8 +46,7 @@ class Trust:
         return (number, *self.fits.solution(anchored, number))
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
+class Standing(NamedTuple):
     """What is known by a ``measurement``: the measured pose (4, 4), its covariance (6, 6) and ``bounds``.
 
     ``believed``: averages, the drift test and learning use the pose.

@@ -6,7 +6,6 @@ learned look doesn't contradict: mounts are knocked rarely, objects hide fingers
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
@@ -181,7 +180,7 @@ class Integrity:
             standing: Standing | None = self._judge(frame, measurement, now_s)
             if standing is not None and self._faded(frame, measurement, now_s):
                 why = "the mount was knocked during the exposure: most edges have lost contrast at once"
-                standing = replace(standing, bounds=unbounded(self._policy.integrity_risk, why), believed=False)
+                standing = standing._replace(bounds=unbounded(self._policy.integrity_risk, why), believed=False)
         else:
             standing = self._held(frame, now_s)
         self._believed = standing is not None and standing.believed
@@ -190,7 +189,7 @@ class Integrity:
             if self._weigher.displaced(standing.measurement, now_s):
                 why = f"{self._weigher.not_as_expected}, and no frame has proved yet where it is"
             none = unbounded(self._policy.integrity_risk, why).since_reference
-            standing = replace(standing, bounds=standing.bounds._replace(since_reference=none))
+            standing = standing._replace(bounds=standing.bounds._replace(since_reference=none))
         if standing is not None:
             self.since.weighed = first
         return standing
@@ -228,7 +227,7 @@ class Integrity:
             proven = again.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             # A knock is rare: even odds suffice against it.
             proven = proven and self._along(frame, measurement, cam_T_grip, risk=1.0).slide_m is None
-            here = here._replace(trust=replace(again, proven=proven))
+            here = here._replace(trust=again._replace(proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
 
     def _trust_in(
@@ -415,4 +414,4 @@ def _reaching(standing: Standing, other_T: Array, why: str) -> Standing:
     """The same, not believed, with a bound that includes another possible pose (4, 4)."""
     away = perturbation_between(standing.cam_T_grip, other_T)
     both = Bounds(*(reaching(each, away, why) for each in standing.bounds))
-    return replace(standing, bounds=both, believed=False)
+    return standing._replace(bounds=both, believed=False)

@@ -7,9 +7,8 @@ knocked, which is rare: the average of the proven poses is the anchor.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.judge.policy import past_alert_limit
@@ -21,7 +20,7 @@ from gripmon.model.records import NOTHING_WRONG, Array, AtReferenceRecord, Prote
 from gripmon.monitor.bounds import SIGMA_INFLATION, larger, protection_of, reaching, unbounded
 from gripmon.monitor.ends import MISREAD_PROBABILITY, EndsEvidence, proof, within
 from gripmon.monitor.known_place import KnownPlace
-from gripmon.monitor.possible import Possible
+from gripmon.monitor.possible import About, Possible
 from gripmon.monitor.refits import Known, Refits, in_the_references_frames
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.since import AtReferences, Bounds
@@ -75,6 +74,7 @@ class Weigher:
         variance_per_s = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._possible = Possible(tracker, gripper, settings, from_record(reference.cam_T_grip))
         self._lasting, self._since = self._possible.lasting, since
+        self._names_ever = self._lasting.name + in_the_references_frames(self._lasting.name)
         taught, play = tracker.taught_at
         if taught is None or not since.begin(taught, len(self._lasting.name), self._possible.model.parts):
             play = (0.0,) * 6  # as if nothing were known of it: where the motion counts from would move with it
@@ -133,8 +133,9 @@ class Weigher:
         odds = shown, 1.0 if may_have_slid else hidden
         besides = odds[1] * prior[hypotheses.ends]
         unsettled = displaced or not self.place.proved
-        without, unsolved = self._without_ends(fits, besides, unsettled)
-        both, knock = self._bounds(fits, without, unsolved, prior, odds, cam_T_grip, displaced)
+        about = self._possible.about(fits.edges)
+        without, unsolved = self._without_ends(fits, about, besides, unsettled)
+        both, knock = self._bounds(fits, about.rows, without, unsolved, prior, odds, cam_T_grip, displaced)
         both = self._with_questions(both, cam_T_grip, displaced)
         # What the frame adds to the anchor: its fits, without the ends where nothing proves them.
         made_of = without if without is not None and not proven and unsettled else fits
@@ -188,7 +189,7 @@ class Weigher:
             why = "edges belong to something else, which looks like another opening and distance"
             away = perturbation_between(self.place.at[0], cam_T_grip)
             both = Bounds(*(reaching(each, away, why) for each in both))
-        return replace(trust, bounds=both, ambiguous=ambiguous, grasped=grasped, most_probable=most_probable)
+        return trust._replace(bounds=both, ambiguous=ambiguous, grasped=grasped, most_probable=most_probable)
 
     def _with_questions(self, both: Bounds, cam_T_grip: Array, displaced: bool) -> Bounds:
         """The bounds while it is open why the first frames differ from the reference: no motion since them, but of what
@@ -208,6 +209,7 @@ class Weigher:
     def _bounds(
         self,
         fits: Refits,
+        rows: NDArray[np.intp],
         without: Refits | None,
         unsolved: float,
         prior: Array,
@@ -217,9 +219,9 @@ class Weigher:
     ) -> tuple[Bounds, Array]:
         """The protection levels of a pose (4, 4), and of the motion since the reference: by what may be wrong where it
         is as known, and after the knocks that the mount may have got since, by the fits and by those ``without`` ends,
-        with what may have been wrong all along, or in the reference's frames alone.  ``unsolved``: probability of what
-        isn't solved; ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the ends show, and of one that only
-        they would.  And how far a knock moves the mount, (6, 6).
+        with what may have been wrong all along, ``rows`` of these hypotheses, or in the reference's frames alone.
+        ``unsolved``: probability of what isn't solved; ``prior`` (h,): of the hypotheses; ``odds``: of a knock that the
+        ends show, and of one that only they would.  And how far a knock moves the mount, (6, 6).
         """
         anchor, lasting, first = self.place.anchor, self._lasting, fits.model.first[0]
         every, (shift, covariance, of_model), risk = fits.hypotheses, fits.alone, self._policy.integrity_risk
@@ -231,8 +233,7 @@ class Weigher:
         elif without is not None:
             of, names = without.hypotheses, names + without.hypotheses.name
             bare = without.alone, (prior[ends] * of.prior * of.more_than_ends, without.stays, of.endless)
-        names += lasting.name + in_the_references_frames(lasting.name)
-        rows, wander = self._possible.about(fits.edges).rows, fits.known.wander
+        names, wander = names + self._names_ever, fits.known.wander
         at_first = prior[:0] if first is None else lasting.priors(first.misread)
         always = (none, cam_T_grip, *self.place.at, wander, rows[:0], prior[:0])
         if anchor is not None and not displaced:
@@ -255,14 +256,15 @@ class Weigher:
             return unbounded(risk, "too much may be wrong at once"), knock
         return Bounds(protection_of(absolute, names, risk), protection_of(since, names, risk)), knock
 
-    def _without_ends(self, fits: Refits, besides: float, unsettled: bool) -> tuple[Refits | None, float]:
+    def _without_ends(
+        self, fits: Refits, about: About, besides: float, unsettled: bool
+    ) -> tuple[Refits | None, float]:
         """The fits where no end of a finger is what it seems besides: the same if none is seen, None where that counts
         little, a knock being of the probability ``besides`` then; and the probability of what isn't solved for that.
         ``unsettled``: of a pose that is displaced, or before one is proved.
         """
         if not fits.hypotheses.across.any():
             return fits, 0.0
-        about = self._possible.about(fits.edges)
         if unsettled:
             return fits.under(about.without_ends), 0.0
         together = besides * about.pairs.of_more_than_ends

@@ -305,4 +305,4 @@ class ForecastMeter(FingertipMeter):
         """Uses the assumed errors: there is no scatter here."""
         scatters = assess(edgels, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
-        return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
+        return scatters._replace(covariance=np.linalg.inv(normal), line_weight=consensus.weight)

@@ -69,7 +69,7 @@ def seen(
         sigma,
         abs(1e-3 * x_mm),
         abs(turn_rad),
-        replace(motion, vibration=vibration),
+        motion._replace(vibration=vibration),
         jumped,
         explanation or Explanation(),
         astray,

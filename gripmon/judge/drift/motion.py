@@ -6,7 +6,6 @@ The part of a shift that an inexact reference explains doesn't count.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 
@@ -134,7 +133,7 @@ class MotionWatch:
     def resume(self, moved: bool) -> None:
         """Continue after a restart; ``moved``: whether the camera was away from its reference."""
         self._present = moved
-        self._last = replace(self._last, present=moved)
+        self._last = self._last._replace(present=moved)
 
     def set_reference_covariance(self, covariance: Array) -> None:
         """Covariance (6, 6) of the reference's own error, which is not a drift."""
@@ -204,7 +203,7 @@ class MotionWatch:
     def skip(self) -> Motion:
         """Skip a frame whose transform is doubtful: nothing changes."""
         self.statistic_share = None
-        return replace(self._last, begun=False, stepped=False, suspicious=False)
+        return self._last._replace(begun=False, stepped=False, suspicious=False)
 
     def _shortest_window(self, shift: Array) -> int:
         """Frames of the shortest window that may decide: the swings of a vibration are not steps, and the mean over a

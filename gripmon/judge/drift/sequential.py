@@ -12,7 +12,7 @@ shown enough extremes of its own, the thresholds of short windows are learnt fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -80,8 +80,7 @@ SEARCH_THRESHOLD_RATIO = 0.25
 """Part of its threshold above which a statistic is worth the search for the tolerated part of the shift."""
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """Result of the test after a frame, for each stream (s,): whether the camera has ``moved``; if so, ``length``, the
     frames of the window that showed it, and ``stepped``, whether the difference showed it or the mean; ``excess``, the
     largest statistic over its threshold.

@@ -97,9 +97,10 @@ class AlertBook:
         ``text``: makes the alert's text, which is asked for where it is published alone.
         """
         entry = self._open.get(topic)
+        since_ns: int | None = stamp_ns
         if entry is None:
             self._raised += 1
-            event, alert_id, since_ns, acknowledged = AlertEvent.RAISED, self._new_id(topic, stamp_ns), stamp_ns, False
+            event, alert_id, acknowledged = AlertEvent.RAISED, self._new_id(topic, stamp_ns), False
         else:
             known = entry.alert
             explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN

@@ -9,7 +9,7 @@ begin one; ``unknown``, don't move by it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,8 +51,7 @@ RELEASE_RATIO = 0.8
 """Part of a limit below which an alert that is past it no longer is."""
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
+class Evidence(NamedTuple):
     """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
     motion ``d_m`` and ``delta_rad`` of equation (14), what the frames so far make of the ``motion``, whether the pose
     jumped against the previous frame, what would explain it, and whether the gripper contradicts its model (a finger or
@@ -100,8 +99,7 @@ class Evidence:
         return bool(way[:3].sum() > swing[:3].sum() or way[3:].sum() > swing[3:].sum())
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(NamedTuple):
     state: State
     verdict: Verdict
     alerts: tuple[Alert, ...]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from gripmon.model.records.alerts import AlertKind, Cause, CauseWeight
 from gripmon.model.records.values import Array
@@ -35,8 +36,7 @@ class Vibration:
     frequency_hz: float
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """The drift test's result for a frame.
 
     ``present``: the camera isn't where the reference has it, by the mean ``shift`` (6,) of the last ``frames`` frames

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -131,7 +130,7 @@ class FingerMeter(Settler):
             rough = self._best(edgels, finger, chain([start], _shifted(edgels, own, start)))
         if rough is None:
             return None
-        there = replace(expected, cam_T_grip=perturb(expected.cam_T_grip, rough.fit.xi[:6]))
+        there = expected._replace(cam_T_grip=perturb(expected.cam_T_grip, rough.fit.xi[:6]))
         with self._zoomed(present):
             edgels = self._look(image, self._predict(self._lay_out(there), there))
             return self._best(edgels, finger, [start])
@@ -152,7 +151,7 @@ class FingerMeter(Settler):
         sampled = int(np.count_nonzero(own[edgels.prediction.ok] == finger))
         if not sampled:
             return None
-        edgels = replace(edgels, weight=np.where(own[edgels.candidates.sample] == finger, edgels.weight, 0.0))
+        edgels = edgels._replace(weight=np.where(own[edgels.candidates.sample] == finger, edgels.weight, 0.0))
         best: _Place | None = None
         for start in starts:
             information = prior_information(0.0)[: len(start)]  # the opening stays

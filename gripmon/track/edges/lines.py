@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +95,7 @@ def _fault_of_view(inside: bool, facing: bool, edges: int) -> int:
     return _Fault.FEW_POINTS if edges < 2 else 0
 
 
-@dataclass(frozen=True, slots=True)
-class Corners:
+class Corners(NamedTuple):
     """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy``
     (c, 2, 2) of each by itself, ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each,
     ``usable`` (c,) where there is none; NaN where a corner was not measured.  ``lines`` (v, 5) of the sampled edges,

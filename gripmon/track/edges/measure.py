@@ -61,8 +61,7 @@ TRUSTED_SHARE_RATIO = 0.4
 """Fraction of the usual inlier ratio below which a fit is not believed, whatever the settings allow."""
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
+class Patience(NamedTuple):
     """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where
     there is none.  ``at_once``: near by in this frame, else the search does that as well.
     """
@@ -188,7 +187,7 @@ class FingertipMeter(FingerMeter):
             moved_px = best.prediction.moved_px
             away = perturbation_between(expected.cam_T_grip, rival), perturbation_between(best.cam_T_grip, rival)
             if min(moved_px(away[0]), moved_px(away[1])) > self._settings.relinearise_px:
-                other = self._settle(image, replace(expected, cam_T_grip=rival))
+                other = self._settle(image, expected._replace(cam_T_grip=rival))
                 best = max(best, other, key=lambda m: m.consensus.share)
         return best
 
@@ -314,7 +313,7 @@ class FingertipMeter(FingerMeter):
             far = abs(opening_m - expected.jaw_opening_m) > 2.1 * step_m
             if far and best.consensus.share >= satisfied and self._shows_nearly_all(best):
                 break
-            there = replace(expected, jaw_opening_m=opening_m)
+            there = expected._replace(jaw_opening_m=opening_m)
             seen = self._predict(prediction.layout, there)
             edgels, prior = self._look(image, seen), self._prior_about(seen, there)
             fit = fit_irls_from_grid(edgels, prior, starts, self._settings.consensus, refine=len(starts))
@@ -358,7 +357,7 @@ class FingertipMeter(FingerMeter):
         found: list[_Place] = []
         layout = None
         for pose in poses:
-            there = replace(expected, cam_T_grip=pose)
+            there = expected._replace(cam_T_grip=pose)
             layout = layout or self._lay_out(there)
             found.append(self._tried(image, there, layout))
             if found[-1].share >= usual_share:

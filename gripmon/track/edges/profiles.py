@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ FEWEST_WIDTHS = 20
 """Edge points from which the blur is estimated."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidates:
+class Candidates(NamedTuple):
     """Edgel hypotheses of one image: ``sample`` (k,) index of the search line, ``offset_px`` (k,) along its normal,
     ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px`` (k,)
     standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a Gaussian,
@@ -189,8 +188,7 @@ def estimate_noise(profiles: Array, quantum: float = 1.0) -> float:
     return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64)), quantum / math.sqrt(12.0))
 
 
-@dataclass(frozen=True, slots=True)
-class Edgels:
+class Edgels(NamedTuple):
     """The edgel hypotheses of one image with what they are worth: ``weight`` (k,) before the robust part, 1/px², zero
     where the taught polarity disagrees; ``edge_spread_px`` (e,) the standard deviation that all points of an edge
     share.

@@ -9,7 +9,7 @@ covariance rests on the scatter that the edgels show, never only on the noise as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,7 @@ ROUNDS = 6
 """Re-weightings at most; half as many from a start that is nearly right."""
 
 
-@dataclass(frozen=True, slots=True)
-class Prior:
+class Prior(NamedTuple):
     """What holds the unknowns (m,) before the image is seen: ``mean`` relative to the prediction, ``information`` in
     1/m², 1/rad².
     """
@@ -48,8 +47,7 @@ class Prior:
     information: Array
 
 
-@dataclass(frozen=True, slots=True)
-class RobustFit:
+class RobustFit(NamedTuple):
     """The common motion of the edgel hypotheses.
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per edgel
@@ -73,8 +71,7 @@ class RobustFit:
     share: float
 
 
-@dataclass(frozen=True, slots=True)
-class NormalEquations:
+class NormalEquations(NamedTuple):
     """What each edge adds to the fit's normal equations; v edges with agreed points, m unknowns.
 
     ``edge`` (v,) of the gripper; ``pull`` (v, m): sum of weight times Jacobian times residual at the fit;
@@ -90,8 +87,7 @@ class NormalEquations:
     lasting: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
+class Uncertainty(NamedTuple):
     """``covariance`` (m, m) of the fit's unknowns; ``line_weight`` (k,) what each edgel hypothesis is worth for the
     line of its edge alone, 1/px², zero for those that don't belong; ``shared_px`` standard deviation that the points of
     a stretch share; ``contradiction``: the weighted squares of the stretches' means over what independent errors of the
@@ -147,7 +143,7 @@ def refit_visible(
     if seen[edges].all() or np.count_nonzero(seen) < FEWEST_EDGES:
         return edgels, consensus
     edge = edgels.prediction.layout.edge[edgels.candidates.sample]
-    rest = replace(edgels, weight=np.where(seen[edge], edgels.weight, 0.0))
+    rest = edgels._replace(weight=np.where(seen[edge], edgels.weight, 0.0))
     return rest, fit_irls(rest, prior, consensus.xi, settings, RESTART_WIDTH_PX)
 
 
@@ -231,7 +227,7 @@ def contradictions_without(edgels: Edgels, prior: Prior, start: Array, settings:
 
 def _without(edgels: Edgels, left_out: int) -> Edgels:
     edge = edgels.prediction.layout.edge[edgels.candidates.sample]
-    return replace(edgels, weight=np.where(edge == left_out, 0.0, edgels.weight))
+    return edgels._replace(weight=np.where(edge == left_out, 0.0, edgels.weight))
 
 
 def fit_irls_from_grid(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -151,8 +151,7 @@ def corner_rms(xy: Any, usable: Any, points_m: Any, predicted_T: Any, cam_T_grip
     return math.sqrt(squares / count) if count else math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class Expected:
+class Expected(NamedTuple):
     """A pose and the two openings that go with it: the one to start from and the one that the robot reports.
 
     ``held_sigma`` (6,): edges are chosen as if the gripper were at ``held_T`` (4, 4) but for that, m and rad; what is
@@ -204,19 +203,19 @@ class Settler:
             prior = self._prior_about(prediction, expected)
             consensus = fit_irls(edgels, prior, start, settings.consensus)
             if expected.held_T is not None:
-                free = self._prior_about(prediction, replace(expected, held_T=None))
+                free = self._prior_about(prediction, expected._replace(held_T=None))
                 consensus = fit_irls(edgels, free, consensus.xi, settings.consensus, RESTART_WIDTH_PX)
             moved_px = prediction.moved_px(consensus.xi)
             if moved_px > 2.0 * self._reach_px:
                 # Nothing was seen there: the few inliers don't determine the motion.
-                consensus = replace(consensus, share=0.0)
+                consensus = consensus._replace(share=0.0)
             if consensus.share == 0.0:
                 break
             expected, moved = self._moved(prediction, consensus.xi, expected), consensus
             if moved_px <= settings.relinearise_px:
                 break
         if expected.held_T is not None:
-            prior = self._prior_about(prediction, replace(expected, held_T=None))
+            prior = self._prior_about(prediction, expected._replace(held_T=None))
         edgels, consensus = refit_visible(edgels, prior, consensus, settings.consensus)
         uncertainty = self._assess(edgels, consensus)
         if uncertainty.contradiction > CONTRADICTION_RATIO and consensus.share > 0.0:

@@ -150,7 +150,7 @@ class FingerStrips:
             return
         strips, within = self._read(self._layout, image, cam_T_grip, jaw_opening_m), self._layout.within
         self._learnt_s = now_s
-        if self.frames >= FIRST_FRAMES and self._alike(self._layout, strips, 0)[0] < LIKE_CORRELATION:
+        if self.frames >= FIRST_FRAMES and _correlations(strips, *self._learnt, 0)[0] < LIKE_CORRELATION:
             self._unlike += 1
             if self._unlike < MOST_FRAMES:
                 return
@@ -160,7 +160,7 @@ class FingerStrips:
         self._mean += (strips - self._mean) * within / min(self.frames, MOST_FRAMES)
         self._prepare(self._layout)
         farther = self._read(self._layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
-        usual = self._alike(self._layout, farther, REACH_PX)
+        usual = _correlations(farther, *self._learnt, REACH_PX)
         self._usual += (usual - self._usual) / min(self.frames, MOST_FRAMES)
         self._know_farther()
 
@@ -205,13 +205,13 @@ class FingerStrips:
         # Read farther at once where that was needed the last time: mostly it is again.
         beyond = self._beyond if alone else REACH_PX
         strips = self._read(layout, image, cam_T_grip, jaw_opening_m, beyond)
-        explained = alone and self._alike(layout, strips, 0)[0] >= most_alike
+        explained = alone and _correlations(strips, *self._learnt, 0)[0] >= most_alike
         self._beyond = 0 if explained else REACH_PX
         if explained:
             return StripsSeen(here=True)  # usually: no slide could be better
         if beyond == 0:
             strips = self._read(layout, image, cam_T_grip, jaw_opening_m, REACH_PX)
-        unexplained = _unexplained(self._alike(layout, strips, REACH_PX), most_alike)
+        unexplained = _unexplained(_correlations(strips, *self._learnt, REACH_PX), most_alike)
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_EDGE_PX : REACH_PX + ONE_EDGE_PX + 1] = 1.0
         best = float(unexplained.min())
@@ -230,12 +230,6 @@ class FingerStrips:
         as_well = math.exp(2.0 / independent * math.log(10.0)) * here >= rival
         return StripsSeen(here=confirmed, undecided=not alone and independent >= FEWEST_POINTS and as_well)
 
-    def _alike(self, layout: _Layout, strips: NDArray[np.float32], reach: int) -> Array:
-        """(2 reach + 1,) correlations with what was learnt, of strips as read, slid along from there; gain and
-        brightness are free, as light is.
-        """
-        return _correlations(strips, self._learnt, layout.within, self._most, self._own, reach)
-
     def _know_farther(self) -> None:
         """What a comparison needs of the usual correlations."""
         farther = _farther_on(self._usual)
@@ -246,10 +240,10 @@ class FingerStrips:
         """What a comparison needs of the mean."""
         # Strips side by side show the same.
         self._independent = float(layout.within.sum()) / (STRIP_LINES * INDEPENDENT_PX)
-        self._most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
-        self._learnt = np.clip(self._mean, -self._most, self._most)
-        self._own = float(np.square(self._learnt).sum())
-        self.ready = self._own > 0.0
+        most = CLIP_SIGMAS * math.sqrt(float(np.square(self._mean).sum() / layout.within.sum()))
+        learnt = np.clip(self._mean, -most, most)
+        own = float(np.square(learnt).sum())
+        self._learnt, self.ready = (learnt, layout.within, most, own), own > 0.0
 
     def _read(
         self, layout: _Layout, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, beyond: int = 0
@@ -421,7 +415,8 @@ def _fast_changes(values: Any) -> NDArray[np.float32]:
 @compiled
 def _correlations(strips: Any, learnt: Any, within: Any, most: float, own: float, reach: int) -> Array:
     """(2 reach + 1,) correlations of ``learnt`` strips (n, l), zero but ``within``, whose squares sum to ``own``, with
-    what ``strips`` (n, w), no farther than ``most`` from zero, show at each slide from their middle.
+    what ``strips`` (n, w), no farther than ``most`` from zero, show at each slide from their middle; gain and
+    brightness are free, as light is.
     """
     (count, length), slides = learnt.shape, 2 * reach + 1
     width, first = length + 2 * reach, (strips.shape[1] - length) // 2 - reach
