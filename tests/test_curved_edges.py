@@ -195,8 +195,7 @@ def test_a_side_of_which_nothing_is_seen_is_not_seen_to_turn():
     assert ends.seen(image, found).seen.tolist() == [2, 2]
     side, consensus = model.edge_ids.index("left_side_a"), found.consensus
     hidden = np.arange(len(model.edge_ids)) == side
-    consensus = replace(
-        consensus,
+    consensus = consensus._replace(
         supported=consensus.supported & (found.prediction.layout.edge != side),
         edge_share=np.where(hidden, 0.0, consensus.edge_share),
         edge_seen=consensus.edge_seen & ~hidden,

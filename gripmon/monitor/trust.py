@@ -200,7 +200,7 @@ class Integrity:
         """
         assert frame.image is not None
         seen, before = measurement.consensus.edge_seen, self._contrast
-        contrast = np.where(seen, np.abs(own_steps(measurement)), 0.0) / float(sparse(frame.image).mean())
+        contrast = np.abs(own_steps(measurement)) * seen / float(sparse(frame.image).mean())
         self._contrast = now_s, contrast
         if before is None or now_s - before[0] > FADED_WITHIN_S:
             return False

@@ -231,6 +231,8 @@ class Policy:
         """What is wrong with the stream of frames just now: kind of fault, cause, and what there is to say of it."""
         book = self.alerts
         alerts: tuple[Alert, ...] = ()
+        if not (faults or book.any):
+            return alerts
         wrong = {
             Topic.STREAM + kind: Alert(AlertKind.STREAM, cause, Severity.ERROR, text) for kind, cause, text in faults
         }

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
+from gripmon.track.edges.evidence import edge_means
 from gripmon.track.edges.lines import SHOWN_BESIDE
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import filter_reach_px, find_candidates, profile_offsets_px, read_profiles
@@ -217,7 +218,7 @@ class FingerEnds:
         maps = probes.map_x + shift_px[:, :1], probes.map_y + shift_px[:, 1:]
         profiles = read_profiles(image, *maps, self._settings.response)
         found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
-        step = own_steps(measurement)[prediction.layout.edge[probes.sample]]
+        step = np.nan_to_num(own_steps(measurement))[prediction.layout.edge[probes.sample]]
         of = found.sample // len(PROBES_PX)
         near = np.abs(found.offset_px) < CONTINUATION_PX
         # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
@@ -339,9 +340,7 @@ def _of_corners(value: NDArray[np.bool_], places: _Places) -> NDArray[np.bool_]:
 
 
 def own_steps(measurement: Measurement) -> Array:
-    """(e,) mean step of each edge's agreed points, grey levels; zero where there are none."""
-    weight, candidates = measurement.consensus.weight, measurement.candidates
-    edges = len(measurement.prediction.line_origin)
-    edge = measurement.prediction.layout.edge[candidates.sample]
-    total = np.bincount(edge, weight, edges)
-    return np.asarray(np.bincount(edge, weight * candidates.step, edges) / np.maximum(total, 1e-12))
+    """(e,) mean step of each edge's agreed points, grey levels; NaN where there are none."""
+    weight, candidates, prediction = measurement.consensus.weight, measurement.candidates, measurement.prediction
+    edges = len(prediction.line_origin)
+    return np.asarray(edge_means(candidates.sample, weight, candidates.step, prediction.layout.edge, edges))

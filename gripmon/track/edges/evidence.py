@@ -194,12 +194,12 @@ def agreeing_shares(finger: Any, edge: Any, ok: Any, supported: Any, fingers: in
 
 
 @compiled
-def edge_means(sample: Any, weight: Any, residual_px: Any, edge: Any, edges: int) -> Any:
-    """(e,) weighted mean of the residuals on each edge; NaN without weight."""
+def edge_means(sample: Any, weight: Any, value: Any, edge: Any, edges: int) -> Any:
+    """(e,) weighted mean of a value of edgel hypotheses on each edge; NaN without weight."""
     total, moment = np.zeros(edges), np.zeros(edges)
     for k in range(len(sample)):
         total[edge[sample[k]]] += weight[k]
-        moment[edge[sample[k]]] += weight[k] * residual_px[k]
+        moment[edge[sample[k]]] += weight[k] * value[k]
     for e in range(edges):
         moment[e] = moment[e] / total[e] if total[e] > 0.0 else np.nan
     return moment

@@ -320,13 +320,14 @@ def refitted(
 
 @compiled
 def _blend(mean: Array, other: Array, gain: Array, backward: bool, out: Array) -> None:
-    """``out`` (6,): mean + K (other - mean), K = ``gain``; the roles swapped if ``backward``."""
+    """``out`` (6,): mean + K (other - mean), ``gain`` K'; the roles swapped if ``backward``."""
     first, last = (other, mean) if backward else (mean, other)
     for i in range(6):
-        total = first[i]
-        for k in range(6):
-            total += gain[i, k] * (last[k] - first[k])
-        out[i] = total
+        out[i] = first[i]
+    for k in range(6):
+        way = last[k] - first[k]
+        for i in range(6):
+            out[i] += gain[k, i] * way
 
 
 @compiled
@@ -344,12 +345,12 @@ def join(
     ``work`` (5, 6, 6) is overwritten.
 
     P, R or both may leave directions open: a product of K and R, large each, has lost the other directions' digits.
-    With the smaller one C of P and R and U U' = (P + R)^-1, K R is C - (C U) (C U)': symmetric, no variance larger than
-    before, and off by no more than C is by rounding.
+    With the smaller one C of P and R, L L' = P + R and V = L^-1 C, K R is C - V' V, and K' is L'^-1 V: symmetric, no
+    variance larger than before, and off by no more than C is by rounding.
     """
     shift, covariance, of_model = measured
     new_mean, new_covariance, new_off = out
-    both, upper, white, smaller = work[0], work[1], work[2], work[3]
+    both, root, white, gain = work[0], work[1], work[2], work[3]
     larger = 0.0
     for i in range(6):
         for j in range(6):
@@ -359,27 +360,41 @@ def join(
     backward = larger > 0.0  # from what was measured to the mean, which is known less well
     for i in range(6):
         for j in range(6):
-            smaller[i, j] = covariance[i, j] if backward else before[i, j]
-    rooted = _inverse(both, white, work[4], upper)
+            new_covariance[i, j] = gain[i, j] = covariance[i, j] if backward else before[i, j]
+    if _root(both, root):
+        for i in range(6):
+            for k in range(i):
+                for j in range(6):
+                    gain[i, j] -= root[i, k] * gain[k, j]
+            for j in range(6):
+                gain[i, j] *= root[i, i]
+                white[i, j] = gain[i, j]
+        for k in range(6):
+            for i in range(6):
+                for j in range(i + 1):
+                    new_covariance[i, j] -= white[k, i] * white[k, j]
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                for j in range(6):
+                    gain[i, j] -= root[k, i] * gain[k, j]
+            for j in range(6):
+                gain[i, j] *= root[i, i]
+    else:
+        smaller, inverse = new_covariance.copy(), np.linalg.inv(both)
+        for i in range(6):
+            for j in range(6):
+                gain[i, j] = 0.0
+                for k in range(6):
+                    gain[i, j] += inverse[i, k] * smaller[k, j]
+        for i in range(6):
+            for j in range(i + 1):
+                for k in range(6):
+                    new_covariance[i, j] -= smaller[i, k] * gain[k, j]
+    taken = 0.0
     for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += smaller[i, k] * upper[k, j]
-            white[i, j] = total
-    share, gain, taken = white if rooted else smaller, both, 0.0
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += share[i, k] * upper[j, k]
-            gain[i, j] = total
         taken += gain[i, i]
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(6):
-                total += share[i, k] * white[j, k]
-            new_covariance[i, j] = new_covariance[j, i] = smaller[i, j] - total
+        for j in range(i):
+            new_covariance[j, i] = new_covariance[i, j]
     _blend(mean, shift, gain, backward, new_mean)
     for f in range(len(new_off)):
         before_off = off[min(f, len(off) - 1)]
