@@ -111,7 +111,8 @@ def test_a_broker_gets_what_came_while_it_was_away(monitor: tuple[Published, str
     published.event(alert_record("while it was away"))
     with passing_on(endpoint, "--mqtt", f"{host}:{port}") as process:
         assert process.stderr is not None
-        assert f"no connection to {host}:{port}; trying again" in process.stderr.readline()
+        said = iter(process.stderr.readline, "")
+        assert any(f"no connection to {host}:{port}; trying again" in line for line in said)
         command = ["mosquitto", "-c", str(tmp_path / "m.conf")]
         with ended(subprocess.Popen(command, stderr=subprocess.DEVNULL, text=True)):
             wait_until(lambda: accepts(f"tcp/{host}:{port}"), "the broker")
@@ -121,6 +122,7 @@ def test_a_broker_gets_what_came_while_it_was_away(monitor: tuple[Published, str
             client.connect(host, int(port))
             client.loop_start()
             wait_until(lambda: heard, "the first")
+            assert any(f"{host}:{port}: Success" in line for line in said), "an operator is told that it is connected"
             published.event(alert_record("now"))
             wait_until(lambda: len(heard) == 2, "the second")
             client.loop_stop()

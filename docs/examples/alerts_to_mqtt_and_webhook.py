@@ -92,6 +92,7 @@ def to_mqtt(host: str, port: int) -> Send:
     import paho.mqtt.client as mqtt
 
     client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+    client.on_connect = lambda _client, _data, _flags, why, _properties: logging.info("%s:%d: %s", host, port, why)
     client.connect_async(host, port)
     client.loop_start()  # it also connects again
 
@@ -131,6 +132,7 @@ def main() -> None:
 
     try:
         with Fleet(connect=given.connect, zenoh_config_file=given.zenoh_config, on_alert=take):
+            logging.info("waiting for alerts at %s", given.zenoh_config or given.connect)
             threading.Event().wait()
     except KeyboardInterrupt:
         pass
