@@ -163,6 +163,11 @@ def test_the_comparison_counts_by_hand():
     assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]
 
 
+def test_frames_before_the_first_event_are_compared():
+    result = compare([record(i, (3e-6, 4e-6, -2e-6)) for i in range(2)], truth)
+    assert result.frames == 2 and result.events == ()
+
+
 @pytest.mark.parametrize(("last", "slow"), [(11, False), (1187, True)])
 def test_a_demo_that_dropped_too_much_says_so_first(tmp_path: Path, last: int, slow: bool):
     """What the figures are worth comes before them, as after 27 of 1188 frames, in which no event was noticed."""

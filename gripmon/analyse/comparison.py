@@ -201,7 +201,7 @@ def _events(pairs: list[_Pair]) -> tuple[EventReport, ...]:
         edges = np.flatnonzero(np.diff(active, prepend=False, append=False)).tolist()
         spans += [(start, end, name) for start, end in zip(edges[::2], edges[1::2], strict=True)]
     spans.sort()
-    following = [start for start, _, _ in spans[1:]] + [len(pairs)]
+    following = [*(start for start, _, _ in spans), len(pairs)][1:]
     return tuple(
         _event_report(name, pairs, start, min(end, limit), limit)
         for (start, end, name), limit in zip(spans, following, strict=True)
