@@ -33,7 +33,8 @@ def run_monitor(folder: Path, robot: str, scenario: str) -> Path:
     """A monitor's recording below ``folder``; its configuration."""
     values = yaml.safe_load(shipped())
     values["robot"] = robot
-    values["source"] |= {"scenario": scenario, "realtime": False, "ends": True, "fps": 20.0, "duration_s": 6.0}
+    # At 21 frames/s stamps are no whole microseconds, as those of most cameras.
+    values["source"] |= {"scenario": scenario, "realtime": False, "ends": True, "fps": 21.0, "duration_s": 6.0}
     values["publish"] = {"enabled": False}
     config = folder / f"{robot}.yaml"
     config.write_text(yaml.safe_dump(values))

@@ -50,7 +50,9 @@ def main(recordings: Path, fleet: Path) -> None:
     for fault in export([recordings], fleet).faults:
         print(fault, file=sys.stderr)
     print("when did which camera move?")
-    for row in movements(fleet).to_pylist():
+    moved = movements(fleet)
+    to_us = moved["noticed"].cast(pa.timestamp("us", "UTC"), safe=False)  # Python's datetime has no nanoseconds
+    for row in moved.set_column(moved.column_names.index("noticed"), "noticed", to_us).to_pylist():
         print(f"  {row['noticed']:%Y-%m-%d %H:%M:%S}  {row['robot']}/{row['camera']}  {1e3 * row['shift_m']:.2f} mm")
     print("how was each day?")
     for row in days(fleet).to_pylist():
