@@ -545,10 +545,15 @@ def test_the_command_writes_what_check_takes(box: tuple, tmp_path: Path, capsys:
     assert "nowhere: the file is missing; an image file, or a folder with images" in capsys.readouterr().err
     words = ["gripper", "from-images", str(folder), "--camera", str(tmp_path / "camera.yaml")]
     outputs = ["--out", str(tmp_path / "gripper.yaml"), "--reference-out", str(tmp_path / "reference.yaml")]
+    left, seen = ["--within", "0,0,384,576"], tmp_path / "seen.png"
+    assert main([*words, *left, *outputs, "--picture", str(seen)]) == 3
+    said = capsys.readouterr().err.splitlines()[-2:]
+    assert said[0].startswith(f"written: {seen} (what was seen; with --force") and seen.is_file()
+    assert said[1].startswith("one finger is seen; --fingers 1") and "a timestamps.csv if the jaws moved" in said[1]
     outputs += ["--picture", str(tmp_path / "gripper.png")]
     assert main([*words, "--distance", "0.115:0.002", *outputs, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["images"] == 30
+    said_of_all = json.loads(capsys.readouterr().out)
+    assert said_of_all["images"] == 30
     assert read_gripper(tmp_path / "gripper.yaml").corner_ids == found.gripper.corner_ids
     assert cv2.imread(str(tmp_path / "gripper.png")).shape == (1152, 1536, 3)
     (tmp_path / "config.yaml").write_text(

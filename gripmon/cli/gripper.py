@@ -15,6 +15,7 @@ from gripmon.cli.common import (
     jaw_opening,
     jaw_range,
     length,
+    note,
     positive_number,
     progress_bar,
     two_numbers,
@@ -218,6 +219,8 @@ def from_images(arguments: Arguments) -> None:
     except UnclearPartsError as unclear:
         _, shown = next(images_of_one_camera(images[unclear.image :]))
         arguments.save("picture", unclear.picture(shown))
+        if arguments.picture is not None:
+            note([f"written: {arguments.picture} (what was seen; with --force the next try replaces it)"])
         raise
     save(arguments, found, provenance, videos=taken.notes)
 

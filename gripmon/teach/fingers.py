@@ -133,7 +133,11 @@ def _chosen(found: list[_Part], still: Bits, wanted: int) -> Parts:
             still,
         )
     if len(parts) < wanted:
-        raise UnclearPartsError("one finger is seen; --fingers 1 if the gripper shows no more", parts, still)
+        raise UnclearPartsError(
+            "one finger is seen; --fingers 1 if the gripper shows no more, a timestamps.csv if the jaws moved",
+            parts,
+            still,
+        )
     if len(parts) > wanted:
         around = "the two, in pixels, or one around each" if wanted > 1 else "the finger, in pixels"
         raise UnclearPartsError(
