@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from support.configurations import shipped
@@ -344,3 +345,24 @@ def test_bash_completes_commands_options_and_choices(tmp_path: Path, capsys: pyt
     with pytest.raises(SystemExit) as refused:
         main(["--print-completion", "tcsh"])
     assert refused.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "input_option"),
+    [
+        (["report", "a.jsonl", "kept.yaml", "--out", "kept.yaml"], "RECORDING"),
+        (["correct", "kept.yaml", "--out", "./kept.yaml"], "RECORDING"),
+        (["replay", "images", "--config", "kept.yaml", "--out", "kept.yaml"], "--config"),
+    ],
+)
+def test_what_a_command_reads_is_not_its_output(
+    words: list[str], input_option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("kept.yaml").write_text(shipped())
+    Path("images").mkdir()
+    cv2.imwrite("images/0.png", np.zeros((576, 768), np.uint8))
+    assert main(words) == 2
+    assert capsys.readouterr().err.endswith(f"{input_option} and --out: both are {Path(words[-1])}; different files\n")
+    assert Path("kept.yaml").read_text() == shipped()

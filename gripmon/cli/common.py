@@ -12,7 +12,7 @@ import math
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -202,7 +202,7 @@ class Arguments(argparse.Namespace):
             path, option = getattr(self, name), _option(name)
             if path is None:
                 continue
-            other = written.setdefault(path.resolve(), option)
+            other = written.setdefault(path.resolve(), self._reading(path, names) or option)
             if other != option:
                 raise InputError(f"{other} and {option}: both are {path}; different files")
             make_directory(path.parent, option)
@@ -212,6 +212,15 @@ class Arguments(argparse.Namespace):
                 raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
             if path.suffix.lower() not in _ENDINGS.get(name, (path.suffix.lower(),)):
                 raise InputError(f"{option} {path}: has no known ending; {' or '.join(_ENDINGS[name][:2])}")
+
+    def _reading(self, path: Path, written: Sequence[str]) -> str | None:
+        """The option by which a file is an input, too; None with --force, which replaces it once it is read."""
+        for name, option in self.command.arguments.items():
+            value = getattr(self, name)
+            for each in value if isinstance(value, list) else [value]:
+                if isinstance(each, Path) and each.resolve() == path.resolve() and name not in written:
+                    return None if hasattr(self, "force") else option or name.upper()
+        return None
 
     def save(self, name: str, content: Any) -> None:
         """Write a file atomically, if its option was given: bytes, a calibration as YAML, a picture in the format of
