@@ -25,16 +25,17 @@ from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
 from gripmon.model.response import in_light, response_of
-from gripmon.teach.finger_depth import PlacedOutlines, place
+from gripmon.teach.finger_depth import PlacedOutlines
 from gripmon.teach.fingers import Box, UnclearPartsError
 from gripmon.teach.image_borders import WELL_SEEN
 from gripmon.teach.image_drawing import draw_outlines
-from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model, finger_outlines
+from gripmon.teach.image_model import MeasuredGripper, as_gaps, build_model
 from gripmon.teach.image_motion import SAME_OPENING_M, WORST_OUTLINE_PX
 from gripmon.teach.image_outline import OpeningSeen, see_opening
 from gripmon.teach.image_size import Length, Pose, depth_by_openings, size_of, travel_of, unit_notes
 from gripmon.teach.matte import FEWEST_IMAGES, STRONG_BLOCKS, blocks, grey_levels, image_sets, smallest_noise
-from gripmon.teach.motion_depth import Moved, move
+from gripmon.teach.motion_depth import Moved
+from gripmon.teach.other_openings import place_and_move
 from gripmon.teach.result import GripperResult
 from gripmon.teach.vanishing import Outline
 
@@ -45,7 +46,7 @@ MOST_IMAGES = 200
 class GripperFromImages(GripperResult):
     """A gripper from images with its pose.  ``outline_sigma_px``: median standard deviation of the outline's vertices
     from their scatter over the images; ``left_out``: images that weren't used, and why; ``seen``: what the others show,
-    ``shown`` the first of them.
+    ``shown`` the first of them; ``used``: of each finger the pieces of its outline that are in the file.
     """
 
     cam_T_grip: Array
@@ -54,10 +55,11 @@ class GripperFromImages(GripperResult):
     left_out: dict[str, str]
     seen: OpeningSeen
     shown: Image
+    used: tuple[tuple[tuple[int, int], ...], ...]
 
     def picture(self) -> Image:
-        """The first image used, with outline, scatter and fingers; BGR."""
-        return draw_outlines(self.shown, self.seen, self.gripper.finger_ids)
+        """The first image used, with outline, scatter and fingers, and what of them isn't in the file; BGR."""
+        return draw_outlines(self.shown, self.seen, self.gripper.finger_ids, self.used)
 
     def values(self) -> dict[str, Any]:
         """The result as plain values: m, rad, px."""
@@ -169,7 +171,8 @@ def gripper_from_images(
         gripper=gripper, notes=tuple(notes), lens=camera, cam_T_grip=cam_T_grip, covariance=covariance,
         opening_m=opening_m, corners=len(gripper.corner_ids), images=used, rms_px=rms_px,
         rms_m=rms_px * float(cam_T_grip[2, 3]) / camera.fx_px, outline_sigma_px=outline_px,
-        left_out=left_out, seen=seen, shown=shown, with_gripper=reference is None, response=light.response,
+        left_out=left_out, seen=seen, shown=shown, used=placed.kept, with_gripper=reference is None,
+        response=light.response,
     )  # fmt: skip
 
 
@@ -219,9 +222,7 @@ class _InSpace(NamedTuple):
     notes: list[str]
 
 
-def _in_space(
-    camera: Camera, every: Mapping[float, OpeningSeen], reference: Pose | None, in_metres: bool
-) -> _InSpace:
+def _in_space(camera: Camera, every: Mapping[float, OpeningSeen], reference: Pose | None, in_metres: bool) -> _InSpace:
     """Of ``every`` opening the first whose outlines are seen to move to the others, since what fingers hide of each
     other, or of a palm, differs; the first one where none is, and of openings that nobody told (not ``in_metres``).
     """
@@ -231,9 +232,7 @@ def _in_space(
         notes, around = list[str](), {opening: other for opening, other in every.items() if opening != first}
         travel = None if reference is None or not in_metres else travel_of(reference, [first, *around])
         try:
-            outlines = finger_outlines(camera, seen)
-            placed = place(outlines, *(at or (None, None)))
-            placed, motion = move(camera, outlines, seen, around, placed, pose=at, travel=travel, notes=notes)
+            outlines, placed, motion = place_and_move(camera, seen, around, pose=at, travel=travel, notes=notes)
         except NoResultError:
             if found is None:
                 raise

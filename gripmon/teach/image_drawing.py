@@ -18,24 +18,32 @@ _INNER: Colour = (0, 144, 255)
 _TEXT: Colour = (255, 255, 255)
 _SCATTER: Colour = (64, 64, 255)
 _UNSEEN: Colour = (255, 64, 255)
+_UNUSED: Colour = (255, 255, 255)
 _ENLARGED = 10.0
 _WIDTH_PX = 1400
 
 
-def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Image:
-    """Draw outlines by finger, corners as circles, and inner edges, over the part of the image around them; at each
-    vertex its scatter, three standard deviations, enlarged; what of the outline doesn't show, as dots.
+def draw_outlines(
+    image: Image, seen: OpeningSeen, names: Sequence[str], used: Sequence[Sequence[tuple[int, int]]]
+) -> Image:
+    """Draw outlines by finger, in white what isn't among the ``used`` pieces of each, corners as circles, and inner
+    edges, over the part of the image around them; at each vertex its scatter, three standard deviations, enlarged; what
+    of the outline doesn't show, as dots.
     """
     outlines = [chain.uv_px for finger in seen.fingers for chain in finger.chains]
     canvas = Canvas.about(image, np.concatenate(outlines), _WIDTH_PX)
     labels = Labels(canvas.picture)
-    for number, (finger, name) in enumerate(zip(seen.fingers, names, strict=True)):
-        colour = _FINGERS[number % len(_FINGERS)]
+    left_out = False
+    for number, (finger, name, own) in enumerate(zip(seen.fingers, names, used, strict=True)):
+        colour, first = _FINGERS[number % len(_FINGERS)], 0
         for edge in finger.inner:
             canvas.line(edge.uv_px, _INNER)
         for chain in finger.chains:
             for a, b in chain.pieces:
-                canvas.line(chain.uv_px[[a, b]], colour)
+                unused = (first + a, first + b) not in own
+                left_out |= unused
+                canvas.line(chain.uv_px[[a, b]], _UNUSED if unused else colour)
+            first += len(chain.uv_px)
             _draw_vertices(canvas, chain, colour)
         vertices = np.concatenate([chain.uv_px for chain in finger.chains])
         labels.put(name, canvas.pixel(vertices[np.argmin(vertices[:, 1])]), colour)
@@ -45,6 +53,7 @@ def draw_outlines(image: Image, seen: OpeningSeen, names: Sequence[str]) -> Imag
     text = (
         f"{len(seen.matte.kept)} images, blur {seen.blur_px:.1f} px; "
         f"red: 3 sigma of their scatter, x {_ENLARGED:g}{'; pink dots: not seen' if len(unseen) else ''}"
+        f"{'; white: not in the file' if left_out else ''}"
     )
     write(canvas.picture, text, (12, canvas.picture.shape[0] - 14), _TEXT, 0.5)
     return canvas.picture

@@ -49,6 +49,8 @@ FROM_BORDER_PX = 6.0
 STEP_PX = 0.5
 WIDE_PX, NARROW_PX = 8.0, 5.0
 """Step and half lengths of search lines."""
+WIDE_SEARCH_PX, NARROW_SEARCH_PX = 4.0, 2.0
+"""Reach of the search on them."""
 _GRID_PX = 0.125
 _SMOOTH_PX = 3.0
 
@@ -150,7 +152,7 @@ def measure_transitions(
     and more exactly.  ``blur_px`` is estimated if None.
     """
     reach = WIDE_PX if wide else NARROW_PX
-    search = 4.0 if wide else 2.0
+    search = WIDE_SEARCH_PX if wide else NARROW_SEARCH_PX
     s = np.arange(-reach, reach + 0.25, STEP_PX)
     profiles = across(images, stations, s)
     within, beyond = s <= -search - 0.5, s >= search + 0.5

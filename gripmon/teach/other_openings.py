@@ -1,0 +1,152 @@
+"""Which pieces of an outline the images of other openings contradict: those that aren't where their finger's motion
+puts them, as the bars of a linkage, which turn while the finger slides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
+from gripmon.teach.finger_depth import PlacedOutlines, place
+from gripmon.teach.image_model import finger_outlines
+from gripmon.teach.image_motion import WORST_OUTLINE_PX, FingerMoved
+from gripmon.teach.image_outline import OpeningSeen
+from gripmon.teach.jaw_fit import AGREEING
+from gripmon.teach.motion_depth import Moved, move
+from gripmon.teach.piece_lines import WORST_SIGMA_PX, jackknife_sigma
+from gripmon.teach.silhouette import WIDE_PX, WIDE_SEARCH_PX, Stations, lines_in_image, measure_transitions
+from gripmon.teach.vanishing import Outline
+
+FEWEST_STATIONS = 4
+"""Pixels of a piece that speak for or against it: as many as a line takes."""
+
+Pieces = frozenset[tuple[int, int]]
+
+
+def place_and_move(
+    camera: Camera,
+    seen: OpeningSeen,
+    around: Mapping[float, OpeningSeen],
+    *,
+    pose: tuple[Array, Array] | None = None,
+    travel: Mapping[float, tuple[float, float]] | None = None,
+    notes: list[str],
+) -> tuple[list[Outline], PlacedOutlines, Moved]:
+    """The fingers of the ``seen`` opening in space, by perspective and by their motion to those ``around``, without
+    what the images of those contradict; other arguments as of :func:`~gripmon.teach.motion_depth.move`.  Raises
+    :class:`~gripmon.model.errors.NoResultError`.
+    """
+    outlines, dropped = finger_outlines(camera, seen), 0
+    while True:
+        first, more = place(outlines, *(pose or (None, None))), list[str]()
+        placed, moved = move(camera, outlines, seen, around, first, pose=pose, travel=travel, notes=more)
+        wrong = contradicted(camera, placed, moved.by_opening, around, seen.blur_px)
+        agreeing = _share_left(outlines, placed, wrong)
+        if agreeing < AGREEING:
+            why = f"only {100.0 * agreeing:.0f} % of the outlines are seen where the fingers' motion puts them"
+            placed, moved = first, Moved({}, None, why)
+        elif any(wrong):
+            dropped += sum(map(len, wrong))
+            outlines = [_without(own, pieces) for own, pieces in zip(outlines, wrong, strict=True)]
+            continue
+        if dropped:
+            more.append(
+                f"{dropped} outer edges aren't used: images of another opening don't show them where the fingers' "
+                "motion puts them, as the bars of a linkage, which turn"
+            )
+        notes += more
+        return outlines, placed, moved
+
+
+def contradicted(
+    camera: Camera,
+    placed: PlacedOutlines,
+    moved: Mapping[float, Sequence[FingerMoved]],
+    around: Mapping[float, OpeningSeen],
+    blur_px: float,
+) -> list[Pieces]:
+    """Of each finger the pieces whose edge, in the images of an opening, lies :data:`WORST_OUTLINE_PX` or more (root
+    mean square, beyond its scatter over the images) beside where the finger's motion puts it, or where only background
+    shows there; and those that join it by these alone, none of which is seen elsewhere.  What another part of the
+    gripper hides, what leaves the image, and what the backgrounds don't show contradicts nothing; nor do outlines that
+    are assumed flat, whose stated tilt moves them by more.
+    """
+    out = []
+    for finger, (points, kept) in enumerate(zip(placed.points, placed.kept, strict=True)):
+        wrong, seen = set[tuple[int, int]](), set[tuple[int, int]]()
+        for opening, motion in ({} if placed.flat else moved).items():
+            for piece in kept:
+                off_px = _beside_px(camera, points[list(piece)] + motion[finger].shift, around[opening], blur_px)
+                if off_px is not None:
+                    (wrong if off_px >= WORST_OUTLINE_PX else seen).add(piece)
+        out.append(frozenset(wrong | _joined_by(wrong, seen, kept)))
+    return out
+
+
+def _joined_by(wrong: set[tuple[int, int]], seen: set[tuple[int, int]], kept: Sequence[tuple[int, int]]) -> Pieces:
+    """The pieces that hang together with no piece that is ``seen`` elsewhere, but for the wrong ones."""
+    if not wrong:
+        return frozenset()
+    left = set(kept) - wrong
+    with_finger = {vertex for piece in seen - wrong for vertex in piece}
+    while True:
+        joined = {piece for piece in left if with_finger & {*piece}}
+        if not joined:
+            return frozenset(left)
+        left -= joined
+        with_finger |= {vertex for piece in joined for vertex in piece}
+
+
+def _beside_px(camera: Camera, ends: Array, seen: OpeningSeen, blur_px: float) -> float | None:
+    """Root mean square of how far an edge with ends (2, 3) lies beside the one that images show, beyond that one's
+    scatter; where it would be seen before background alone, as far as the search goes.  None if too little
+    is seen.
+    """
+    if not (np.isfinite(ends).all() and (ends[:, 2] > 0.0).all()):
+        return None
+    matte, shape = seen.matte, seen.matte.still.shape
+    uv, normal = _stations(camera, ends)
+    inside = lines_in_image(uv, normal, shape, WIDE_PX)
+    stations = Stations(uv, normal, inside)
+    found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
+    across = np.arange(-WIDE_SEARCH_PX, WIDE_SEARCH_PX + 0.5)[:, None, None]
+    column, row = np.moveaxis(np.rint(uv + across * normal).astype(int), 2, 0)
+    still = matte.still[np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)]
+    gone = inside & ~found.usable & ~still.any(axis=0)
+    sigma_px = jackknife_sigma(found.folds_px)
+    known = (found.usable & (sigma_px < WORST_SIGMA_PX)) | gone
+    if np.count_nonzero(known) < FEWEST_STATIONS:
+        return None
+    off_px2 = np.where(gone, WIDE_SEARCH_PX**2, np.square(found.offset_px) - np.square(sigma_px))
+    return float(np.sqrt(max(off_px2[known].mean(), 0.0)))
+
+
+def _stations(camera: Camera, ends: Array) -> tuple[Array, Array]:
+    """Points (s, 2) a pixel apart on an edge's image, and normals (s, 2) away from the gripper, which is on the left
+    going along it.
+    """
+    xy = ends[:, :2] / ends[:, 2:]
+    count = max(round(camera.fx_px * float(np.linalg.norm(xy[1] - xy[0]))), 1)
+    share = (np.arange(count) + 0.5)[:, None] / count
+    uv, ahead = (camera.distort(xy[0] + part * (xy[1] - xy[0])) for part in (share, share + 1e-3))
+    way = (ahead - uv) / np.linalg.norm(ahead - uv, axis=1)[:, None]
+    return uv, np.column_stack([-way[:, 1], way[:, 0]])
+
+
+def _share_left(outlines: Sequence[Outline], placed: PlacedOutlines, wrong: Sequence[Pieces]) -> float:
+    """Of the placed outlines' length in the image, without the wrong pieces."""
+    total = left = 0.0
+    for outline, kept, pieces in zip(outlines, placed.kept, wrong, strict=True):
+        for piece, length in zip(outline.pieces, outline.length_px.tolist(), strict=True):
+            total += length * (piece in kept)
+            left += length * (piece in kept and piece not in pieces)
+    return left / max(total, 1e-9)
+
+
+def _without(outline: Outline, pieces: Pieces) -> Outline:
+    left = [k for k, piece in enumerate(outline.pieces) if piece not in pieces]
+    return replace(outline, pieces=tuple(outline.pieces[k] for k in left), length_px=outline.length_px[left])
