@@ -40,26 +40,25 @@ def place_and_move(
     what the images of those contradict; other arguments as of :func:`~gripmon.teach.motion_depth.move`.  Raises
     :class:`~gripmon.model.errors.NoResultError`.
     """
-    outlines, dropped = finger_outlines(camera, seen), 0
-    while True:
-        first, more = place(outlines, *(pose or (None, None))), list[str]()
-        placed, moved = move(camera, outlines, seen, around, first, pose=pose, travel=travel, notes=more)
-        wrong = contradicted(camera, placed, moved.by_opening, around, seen.blur_px)
-        agreeing = _share_left(outlines, placed, wrong)
-        if agreeing < AGREEING:
-            why = f"only {100.0 * agreeing:.0f} % of the outlines are seen where the fingers' motion puts them"
-            placed, moved = first, Moved({}, None, why)
-        elif any(wrong):
-            dropped += sum(map(len, wrong))
-            outlines = [_without(own, pieces) for own, pieces in zip(outlines, wrong, strict=True)]
-            continue
-        if dropped:
-            more.append(
-                f"{dropped} outer edges aren't used: images of another opening don't show them where the fingers' "
-                "motion puts them, as the bars of a linkage, which turn"
-            )
-        notes += more
-        return outlines, placed, moved
+    outlines = finger_outlines(camera, seen)
+    first = place(outlines, *(pose or (None, None)))
+    placed, moved = move(camera, outlines, seen, around, first, pose=pose, travel=travel, notes=notes)
+    found = contradicted(camera, placed, moved.by_opening, around, seen.blur_px)
+    agreeing = _share_left(outlines, placed, [wrong for wrong, _ in found])
+    if agreeing < AGREEING:
+        why = f"only {100.0 * agreeing:.0f} % of the outlines are seen where the fingers' motion puts them"
+        return outlines, first, Moved({}, None, why)
+    unused = [wrong | _hanging_on(wrong, shown, kept) for (wrong, shown), kept in zip(found, placed.kept, strict=True)]
+    if any(unused):
+        notes.append(
+            f"{sum(map(len, unused))} outer edges aren't used: images of another opening don't show them where the "
+            "fingers' motion puts them, as the bars of a linkage, which turn"
+        )
+        # They hardly counted when the motion was found.
+        outlines = [_without(own, pieces) for own, pieces in zip(outlines, unused, strict=True)]
+        kept = zip(placed.kept, unused, strict=True)
+        placed = replace(placed, kept=tuple(tuple(k for k in own if k not in pieces) for own, pieces in kept))
+    return outlines, placed, moved
 
 
 def contradicted(
@@ -68,37 +67,37 @@ def contradicted(
     moved: Mapping[float, Sequence[FingerMoved]],
     around: Mapping[float, OpeningSeen],
     blur_px: float,
-) -> list[Pieces]:
+) -> list[tuple[Pieces, Pieces]]:
     """Of each finger the pieces whose edge, in the images of an opening, lies :data:`WORST_OUTLINE_PX` or more (root
     mean square, beyond its scatter over the images) beside where the finger's motion puts it, or where only background
-    shows there; and those that join it by these alone, none of which is seen elsewhere.  What another part of the
-    gripper hides, what leaves the image, and what the backgrounds don't show contradicts nothing; nor do outlines that
-    are assumed flat, whose stated tilt moves them by more.
+    shows there; and those that are seen where it puts them.  What another part of the gripper hides, what leaves the
+    image, and what the backgrounds don't show are neither; nor are outlines that are assumed flat, whose stated tilt
+    moves them by more.
     """
     out = []
     for finger, (points, kept) in enumerate(zip(placed.points, placed.kept, strict=True)):
-        wrong, seen = set[tuple[int, int]](), set[tuple[int, int]]()
+        wrong, shown = set[tuple[int, int]](), set[tuple[int, int]]()
         for opening, motion in ({} if placed.flat else moved).items():
             for piece in kept:
                 off_px = _beside_px(camera, points[list(piece)] + motion[finger].shift, around[opening], blur_px)
                 if off_px is not None:
-                    (wrong if off_px >= WORST_OUTLINE_PX else seen).add(piece)
-        out.append(frozenset(wrong | _joined_by(wrong, seen, kept)))
+                    (wrong if off_px >= WORST_OUTLINE_PX else shown).add(piece)
+        out.append((frozenset(wrong), frozenset(shown - wrong)))
     return out
 
 
-def _joined_by(wrong: set[tuple[int, int]], seen: set[tuple[int, int]], kept: Sequence[tuple[int, int]]) -> Pieces:
-    """The pieces that hang together with no piece that is ``seen`` elsewhere, but for the wrong ones."""
-    if not wrong:
-        return frozenset()
-    left = set(kept) - wrong
-    with_finger = {vertex for piece in seen - wrong for vertex in piece}
-    while True:
-        joined = {piece for piece in left if with_finger & {*piece}}
-        if not joined:
-            return frozenset(left)
-        left -= joined
-        with_finger |= {vertex for piece in joined for vertex in piece}
+def _hanging_on(wrong: Pieces, shown: Pieces, kept: Sequence[tuple[int, int]]) -> Pieces:
+    """The pieces that hang on wrong ones and, without these, on none that is ``shown`` elsewhere."""
+
+    def grown(start: Pieces) -> set[tuple[int, int]]:
+        out, more = set[tuple[int, int]](), set(start)
+        while more:
+            out |= more
+            ends = {vertex for piece in more for vertex in piece}
+            more = {piece for piece in kept if ends & {*piece}} - out - wrong
+        return out
+
+    return frozenset(grown(wrong) - wrong - grown(shown))
 
 
 def _beside_px(camera: Camera, ends: Array, seen: OpeningSeen, blur_px: float) -> float | None:
@@ -144,7 +143,7 @@ def _share_left(outlines: Sequence[Outline], placed: PlacedOutlines, wrong: Sequ
         for piece, length in zip(outline.pieces, outline.length_px.tolist(), strict=True):
             total += length * (piece in kept)
             left += length * (piece in kept and piece not in pieces)
-    return left / max(total, 1e-9)
+    return left / total if total else 1.0
 
 
 def _without(outline: Outline, pieces: Pieces) -> Outline:
