@@ -85,6 +85,12 @@ def test_an_outline_that_is_assumed_flat_may_lie_elsewhere() -> None:
     assert wrong(20.0, flat=True) == frozenset()
 
 
+def test_what_hangs_on_a_bar_alone_goes_with_it() -> None:
+    """Of a chain cut in two by a piece that turns, one part of which is seen elsewhere, and of a piece by itself."""
+    hanging = other_openings._hanging_on(frozenset({(2, 3)}), frozenset({(5, 6)}), [*PIECES, (9, 10)])
+    assert hanging == {(0, 1), (1, 2)}
+
+
 @pytest.mark.parametrize(("bar_px", "left"), [(10.0, PIECES[:1] + PIECES[4:]), (1000.0, PIECES)])
 def test_a_finger_is_written_without_its_bar(
     bar_px: float, left: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch

@@ -68,11 +68,10 @@ def contradicted(
     around: Mapping[float, OpeningSeen],
     blur_px: float,
 ) -> list[tuple[Pieces, Pieces]]:
-    """Of each finger the pieces whose edge, in the images of an opening, lies :data:`WORST_OUTLINE_PX` or more (root
-    mean square, beyond its scatter over the images) beside where the finger's motion puts it, or where only background
-    shows there; and those that are seen where it puts them.  What another part of the gripper hides, what leaves the
-    image, and what the backgrounds don't show are neither; nor are outlines that are assumed flat, whose stated tilt
-    moves them by more.
+    """Of each finger the pieces whose edge, in the images of an opening, lies :data:`WORST_OUTLINE_PX` or more (in the
+    median over its pixels) beside where the finger's motion puts it, or where only background shows there; and those
+    that are seen where it puts them.  What another part of the gripper hides, what leaves the image, and what the
+    backgrounds don't show are neither; nor are outlines that are assumed flat, whose stated tilt moves them by more.
     """
     out = []
     for finger, (points, kept) in enumerate(zip(placed.points, placed.kept, strict=True)):
@@ -101,9 +100,8 @@ def _hanging_on(wrong: Pieces, shown: Pieces, kept: Sequence[tuple[int, int]]) -
 
 
 def _beside_px(camera: Camera, ends: Array, seen: OpeningSeen, blur_px: float) -> float | None:
-    """Root mean square of how far an edge with ends (2, 3) lies beside the one that images show, beyond that one's
-    scatter; where it would be seen before background alone, as far as the search goes.  None if too little
-    is seen.
+    """How far an edge with ends (2, 3) lies beside the one that images show, in the median over its pixels; where only
+    background shows, as far as the search goes.  None if too little is seen.
     """
     if not (np.isfinite(ends).all() and (ends[:, 2] > 0.0).all()):
         return None
@@ -116,12 +114,10 @@ def _beside_px(camera: Camera, ends: Array, seen: OpeningSeen, blur_px: float) -
     column, row = np.moveaxis(np.rint(uv + across * normal).astype(int), 2, 0)
     still = matte.still[np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)]
     gone = inside & ~found.usable & ~still.any(axis=0)
-    sigma_px = jackknife_sigma(found.folds_px)
-    known = (found.usable & (sigma_px < WORST_SIGMA_PX)) | gone
+    known = (found.usable & (jackknife_sigma(found.folds_px) < WORST_SIGMA_PX)) | gone
     if np.count_nonzero(known) < FEWEST_STATIONS:
         return None
-    off_px2 = np.where(gone, WIDE_SEARCH_PX**2, np.square(found.offset_px) - np.square(sigma_px))
-    return float(np.sqrt(max(off_px2[known].mean(), 0.0)))
+    return float(np.median(np.where(gone, WIDE_SEARCH_PX, np.abs(found.offset_px))[known]))
 
 
 def _stations(camera: Camera, ends: Array) -> tuple[Array, Array]:
