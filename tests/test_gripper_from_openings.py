@@ -235,6 +235,26 @@ def test_openings_are_told_apart_without_a_table() -> None:
     assert image_sets(images[:16]) == [list(range(16))]
 
 
+def test_plain_fingers_before_views_of_one_room_are_told_apart() -> None:
+    """Ten images of each opening before parts of three walls, by which two images are more alike than by fingers."""
+    rng = np.random.default_rng(0)
+    walls = np.full((3, 700, 900), 90.0, np.float32)
+    for wall in walls:
+        for _ in range(150):
+            x, y, width, height = rng.integers((0, 0, 30, 30), (900, 700, 160, 160)).tolist()
+            wall[y : y + height, x : x + width] = rng.uniform(20.0, 230.0)
+    images = []
+    for k in range(20):
+        left, top = rng.integers((0, 0), (260, 220)).tolist()
+        image = walls[rng.integers(3), top : top + 480, left : left + 640].copy()
+        for x in ((200, 400), (230, 370))[k // 10]:
+            image[390:, x : x + 30] = 120.0
+        images.append(image + rng.normal(0.0, 2.0, image.shape).astype(np.float32))
+    order = rng.permutation(20).tolist()
+    sets = image_sets([images[k] for k in order])
+    assert sorted(sorted(order[k] for k in own) for own in sets) == [list(range(10)), list(range(10, 20))]
+
+
 def test_a_slow_video_of_one_opening_is_one_set() -> None:
     """Three times a camera stays before about the same view, which then stays in a third of the images."""
     rng = np.random.default_rng(5)

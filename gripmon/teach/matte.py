@@ -8,15 +8,12 @@ pixel or so: each is moved back, first by the direction of edges, and then adjus
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.cluster.hierarchy import linkage
-from scipy.spatial.distance import squareform
 
 from gripmon.model.errors import NoResultError
 from gripmon.model.pixels import GREY_BGR
@@ -54,6 +51,8 @@ SMALLEST_PART = 100
 """Smallest part of a gripper (px): a tip of 10 x 10 px."""
 MOST_STILL_SHARE = 0.9
 """Largest part of the image that stays: a gripper that hides more of the view leaves too little background."""
+MOST_ROUNDS = 20
+"""In which images change between two sets: some five are enough."""
 _STEP = 3
 _MAD = 1.4826
 _SMALL = 4
@@ -304,22 +303,69 @@ def image_sets(images: Sequence[Plane]) -> list[list[int]]:
     set has at least :data:`FEWEST_IMAGES`; fewer images unlike all others stay with a set, whose matte rejects them.
     """
     features = np.stack([_directions(image) for image in images])
-    flat = features.reshape(len(images), -1)
-    length = np.linalg.norm(flat, axis=1)
-    apart = 1.0 - np.clip((flat @ flat.T) / np.maximum(np.outer(length, length), 1e-9), -1.0, 1.0)
-    np.fill_diagonal(apart, 0.0)
-    nodes = [[[k]] for k in range(len(images))]
-    if len(images) > 1:
-        for i, j in linkage(squareform(apart, checks=False), "average")[:, :2]:
-            both = [*nodes[int(i)], *nodes[int(j)]]
-            if len(both) == 2 and not _differ(features, both[0], both[1]):
-                both = [both[0] + both[1]]
-            nodes.append(both)
-    found = [part for part in nodes[-1] if len(part) >= FEWEST_IMAGES] or [list(itertools.chain(*nodes[-1]))]
-    for part in nodes[-1]:
-        if len(part) < FEWEST_IMAGES and part not in found:
-            min(found, key=lambda own: float(apart[np.ix_(part, own)].mean())).extend(part)
-    return sorted(map(sorted, {tuple(own): own for own in found}.values()), key=lambda own: (-len(own), own[0]))
+    found, left = list[list[int]](), [list(range(len(images)))]
+    while left:
+        own = left.pop()
+        there = _halves(features[own])
+        parts = [[k for k, first in zip(own, there, strict=True) if first is side] for side in (True, False)]
+        if _differ(features, *parts):
+            left += parts
+        else:
+            found.append(own)
+    return sorted(found, key=lambda own: (-len(own), own[0]))
+
+
+def _halves(features: Plane) -> list[bool]:
+    """Which of images (n, 2, h, w) belong to the first of the two sets in which most stays; all where none is large
+    enough.
+
+    Each image goes to the set whose staying edges it shows more of (as in k-means, without its own share in them),
+    until none changes: begun with the first half, with every other image, and with the signs of the four leading
+    eigenvectors of the images' likeness, in which objects behind the gripper count as much.
+    """
+    count = len(features)
+    flat = features.reshape(count, -1)
+    length = np.maximum(np.linalg.norm(flat, axis=1), 1e-9)
+    likeness = flat @ flat.T / np.outer(length, length)
+    np.fill_diagonal(likeness, 0.0)
+    vectors = np.linalg.eigh(likeness)[1][:, :-5:-1].T
+    order, best, most = np.arange(count), np.ones(count, bool), 0.0
+    for start in (order < count // 2, order % 2 == 0, *(vector > np.median(vector) for vector in vectors)):
+        there = _settled(features, start)
+        sets = [own for own in (there, ~there) if np.count_nonzero(own) >= FEWEST_IMAGES]
+        stays = sum(np.count_nonzero(own) * float(_staying(features[own]).sum()) for own in sets)
+        if len(sets) == 2 and stays > most:
+            best, most = there, stays
+    return best.tolist()
+
+
+def _settled(features: Plane, there: Bits) -> Bits:
+    """Which images (n, 2, h, w) are in the first of two sets when none would rather change, begun with ``there``."""
+    squares = np.square(features).sum(axis=1)
+    for _ in range(MOST_ROUNDS):
+        shown = np.empty((2, len(features)))
+        for side, own in enumerate((~there, there)):
+            size = np.count_nonzero(own)
+            if size < 2:
+                return there
+            mean, stays = features[own].mean(axis=0), _staying(features[own])
+            share = np.sqrt(stays / np.maximum(np.square(mean).sum(axis=0), 1e-12))
+            shown[side] = np.tensordot(features, share * mean, 3)
+            # Without what an image itself adds to its set's mean.
+            itself = np.tensordot(squares, share, 2)
+            shown[side] = np.where(own, (size * shown[side] - itself) / (size - 1), shown[side])
+            shown[side] /= max(math.sqrt(float(stays.sum())), 1e-9)
+        then = shown[1] > shown[0]
+        if (then == there).all():
+            break
+        there = then
+    return there
+
+
+def _staying(features: Plane) -> Plane:
+    """Square of the mean direction (h, w) over images (n, 2, h, w), beyond three times what chance makes it."""
+    mean, each = _resultant(features)
+    return np.maximum(mean - 3.0 / len(features) * each, 0.0)
 
 
 def _directions(image: Plane) -> Plane:
