@@ -58,8 +58,8 @@ def page(*arguments: object, command: tuple[str, ...] = ("teach", "--page")) -> 
             process.communicate()
 
 
-def browser() -> Any:
-    """A headless browser; the test is skipped where there is none."""
+def browser(*flags: str) -> Any:
+    """A headless browser, with some more flags; the test is skipped where there is none."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium isn't installed")
     from selenium.webdriver.chrome.service import Service
 
@@ -69,7 +69,7 @@ def browser() -> Any:
         pytest.skip(f"no headless browser: none of {', '.join(BROWSERS)} with chromedriver")
     options = selenium.ChromeOptions()
     options.binary_location = program
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,900"):
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,900", *flags):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     return selenium.Chrome(service=Service(driver), options=options)
