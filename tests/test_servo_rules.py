@@ -120,14 +120,14 @@ def test_the_exit_code_says_whether_all_was_reached(
     pytest.importorskip("pinocchio")
     import json
 
-    from servoing import __main__ as command
+    from benchmarks import __main__ as command
     from servoing import runs
 
     def run(row, number, *_args, **_named):
         return _whole_run(row, number, off_mm=off_mm, verdicts=verdicts, places=places)
 
     monkeypatch.setattr(runs, "run", run)
-    monkeypatch.setattr(sys, "argv", ["servo", "--runs", "1", "--json", str(tmp_path / "servo.json")])
+    monkeypatch.setattr(sys, "argv", ["bench", "servo", "--runs", "1", "--json", str(tmp_path / "servo.json")])
     assert command.main() == code
     assert said in capsys.readouterr().out
     rows = json.loads((tmp_path / "servo.json").read_text())["rows"]

@@ -28,6 +28,7 @@ BENCHMARKS = {
     "record": "what recording costs: loop, disk, memory, a kill; and reading an hour of it",
     "recovery": "back on track after jumps of the camera, and never at a wrong place",
     "series": "the self-viewing paper's two series of image pairs, its tables beside ours",
+    "servo": "a simulated arm grasps by the monitor's transform while its camera is knocked; tools/servo",
     "shapes": "fingers of any shape, from CAD, while the camera moves",
     "wire": "time from frame to another process's callback; stalled subscribers, a router, its restart",
 }
