@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import multiprocessing
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 from scipy import stats
 from tqdm import tqdm
@@ -90,17 +91,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def plain(value: Any) -> Any:
     """As JSON takes it; None for what is infinite or no number."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+    def as_built_in(other: Any) -> Any:
+        return other.tolist() if isinstance(other, np.ndarray | np.generic) else str(other)
+
+    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=as_built_in))
 
 
 def percent(share: float | None, digits: int = 1) -> str:
@@ -175,6 +170,15 @@ def chosen(asked: Sequence[str], there: Iterable[str]) -> list[str]:
         if name not in names:
             raise Refused(f"--only {name}: there is no such row; one of {', '.join(names)}")
     return [name for name in names if name in (asked or names)]
+
+
+def until(condition: Callable[[], object], otherwise: str, within_s: float = 60.0) -> None:
+    """Wait for something in another process or thread.  RuntimeError that says ``otherwise``: it took too long."""
+    end_s = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise RuntimeError(otherwise)
+        time.sleep(0.01)
 
 
 def progress(items: Iterable[_T], unit: str, total: int | None = None) -> Iterator[_T]:

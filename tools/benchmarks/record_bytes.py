@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ POLICIES: dict[str, dict[str, Any]] = {
     "1 image/s, JPEG 85": {"image_rate_hz": 1.0},
     "no images but at alerts": {"image_rate_hz": 0.0},
 }
-_WRITTEN_WITHIN_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ def _one(ring: scene.Ring, plan: Plan, changes: dict[str, Any]) -> dict[str, Any
 
         def look(seq: int) -> None:
             if seq in (begin, count):
-                _wait_until_written(recorder)
+                kit.until(lambda: recorder.waiting <= 0, "the recording doesn't get on")
                 marks.append((seq, sum(file.stat().st_size for file in Path(directory).glob("*.rrd"))))
 
         # One more frame: the look comes before a frame.
@@ -85,11 +83,3 @@ def _one(ring: scene.Ring, plan: Plan, changes: dict[str, Any]) -> dict[str, Any
         "frames": last - first,
         "images_dropped": recorder.images_dropped,
     }
-
-
-def _wait_until_written(recorder: SwitchedRecorder) -> None:
-    end_s = time.monotonic() + _WRITTEN_WITHIN_S
-    while recorder.waiting > 0:
-        if time.monotonic() > end_s:
-            raise RuntimeError(f"the recording doesn't get on: {recorder.failure or 'no word why'}")
-        time.sleep(0.02)

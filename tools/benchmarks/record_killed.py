@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import kit
 from benchmarks.parts import Measured, Row
 from benchmarks.scene import FPS
 
 _DAEMON = Path(__file__).parent / "recorded_daemon.py"
-_START_WITHIN_S = 60.0
 LOSS_S = 2.0
 """To reach: the most that a kill loses."""
 _FRAMES = 100_000  # no one gets that far
@@ -59,7 +59,8 @@ def _kill_once(path: Path, after_s: float, daemon_first: bool) -> dict[str, Any]
             word, worker = daemon.stdout.readline().decode().split()
             if word != "recording" or not daemon.stdout.readline():
                 raise RuntimeError("the daemon did not start")
-            _wait_for_a_file(Path(directory))
+            # It takes a second or two: what a kill costs until then isn't the question.
+            kit.until(lambda: any(Path(directory).glob("*.rrd")), "no recording began")
             time.sleep(after_s)
             pids = [daemon.pid, int(worker)]
             for pid in pids if daemon_first else reversed(pids):
@@ -76,15 +77,6 @@ def _kill_once(path: Path, after_s: float, daemon_first: bool) -> dict[str, Any]
         "opened": opened,
         "loss_s": (delivered - newest) / FPS,
     }
-
-
-def _wait_for_a_file(directory: Path) -> None:
-    """The recording process takes a second or two to start: what a kill costs until then isn't the question."""
-    end_s = time.monotonic() + _START_WITHIN_S
-    while not any(directory.glob("*.rrd")):
-        if time.monotonic() > end_s:
-            raise RuntimeError("no recording began")
-        time.sleep(0.01)
 
 
 def read_back(directory: Path) -> tuple[bool, int]:

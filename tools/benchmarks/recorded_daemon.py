@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from pathlib import Path
 
 import cv2
 
-from benchmarks import harness, scene
+from benchmarks import harness, kit, scene
 from benchmarks.switched import SwitchedRecorder
 from gripmon.model.outputs import Notes, Output, Trace
 from gripmon.model.records import Frame, FrameRecord
-
-_START_WITHIN_S = 60.0
 
 
 class _Said(Output):
@@ -28,24 +25,14 @@ class _Said(Output):
         os.write(1, b"%d\n" % record.seq)
 
 
-def _process_of(recorder: SwitchedRecorder) -> int:
-    """It starts beside the loop; RuntimeError if it doesn't within a minute."""
-    end_s = time.monotonic() + _START_WITHIN_S
-    while recorder.process_id is None:
-        if time.monotonic() > end_s:
-            raise RuntimeError("no recording process began")
-        time.sleep(0.01)
-    return recorder.process_id
-
-
 def main(ring_path: str, directory: str, frames: str) -> None:
     cv2.setNumThreads(1)
     ring = scene.Ring.load(Path(ring_path))
-    height_px, width_px = ring.images.shape[1:]
-    config = scene.config_for((width_px, height_px))
+    config = scene.config_for(ring.size)
     recorder = SwitchedRecorder(config, Path(directory))
     recorder.on = True
-    os.write(1, b"recording %d\n" % _process_of(recorder))
+    kit.until(lambda: recorder.process_id is not None, "no recording process began")  # it starts beside the loop
+    os.write(1, b"recording %d\n" % recorder.process_id)
     harness.run_loop(config, harness.RingSource(ring, int(frames), paced=True), _Said(), recorder)
 
 

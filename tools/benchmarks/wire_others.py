@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import zenoh
 
+from benchmarks import kit
 from benchmarks.harness import Subscriber, free_endpoint
 from benchmarks.machine import ROOT
 from gripmon.io.wire import DEFAULT_ENDPOINT
@@ -61,19 +61,17 @@ class Crowd:
 class RouterProcess:
     """``gripmon router``; ``up_ns`` is when it last reported that it listens, by the clock that all processes share."""
 
-    def __init__(self, folder: Path, *, shared_memory: bool = True) -> None:
-        """The shipped configuration for one machine; without ``shared_memory`` it talks as to other machines."""
+    def __init__(self, folder: Path) -> None:
+        """The shipped configuration for one machine."""
         self.endpoint = free_endpoint()
         self.up_ns = 0
         self._file = folder / f"router-{self.endpoint.rpartition(':')[2]}.json5"
         text = (ROOT / "configs" / "zenoh" / "local.json5").read_text().replace(DEFAULT_ENDPOINT, self.endpoint)
-        if not shared_memory:
-            text = text.replace("shared_memory: {", "shared_memory: { enabled: false,", 1)
         self._file.write_text(text)
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
         self.start()
-        self.wait()
+        kit.until(lambda: self.up_ns, "the router did not start")
 
     @property
     def pid(self) -> int:
@@ -87,14 +85,6 @@ class RouterProcess:
         )
         self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
         self._reader.start()
-
-    def wait(self) -> None:
-        """Until it listens."""
-        end_s = time.monotonic() + 60.0
-        while not self.up_ns:
-            if time.monotonic() > end_s or (self._process is not None and self._process.poll() is not None):
-                raise RuntimeError("the router did not start")
-            time.sleep(0.01)
 
     def kill(self) -> None:
         assert self._process is not None and self._reader is not None
@@ -112,5 +102,3 @@ class RouterProcess:
         for line in process.stderr:
             if "listening" in line:
                 self.up_ns = time.monotonic_ns()
-            elif os.environ.get("GRIPMON_BENCH_VERBOSE"):
-                print(line, end="", file=sys.stderr)

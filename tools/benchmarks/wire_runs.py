@@ -249,11 +249,7 @@ def _wires(config: Any, scratch: Path) -> Iterator[_Wires]:
         publishers = [ZenohPublisher(link, *names) for link in links]
         for publisher in publishers:
             opened.callback(publisher.close)
-        end_s = time.monotonic() + 30.0
-        while not links[1].connected:
-            if time.monotonic() > end_s:
-                raise RuntimeError("the router was not reached")
-            time.sleep(0.01)
+        kit.until(lambda: links[1].connected, "the router was not reached", 30.0)
         key = publishers[0].keys["transform"]
         subscribers = [harness.Subscriber(place, key) for place in (endpoint, router.endpoint)]
         yield _Wires(links, publishers, subscribers, router, endpoint)

@@ -153,11 +153,7 @@ def _said(found: dict[str, Any]) -> Measured:
 
 def _client(endpoint: str, policy: Policy) -> TransformClient:
     client = TransformClient("bench", connect=[endpoint], policy=policy)
-    end_s = time.monotonic() + 30.0
-    while not client.latest().usable:
-        if time.monotonic() > end_s:
-            raise RuntimeError(f"no transform came: {client.latest().reason}")
-        time.sleep(0.01)
+    kit.until(lambda: client.latest().usable, "no transform came that is usable", 30.0)
     return client
 
 
