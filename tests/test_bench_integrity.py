@@ -150,7 +150,7 @@ def test_the_monitor_that_is_judged_gets_the_frozen_limits():
     settings = _settings(watched)
     assert (settings.policy.alert_limit_m, settings.policy.alert_limit_rad) == (2.52e-3, 0.035)
     assert settings.corners.edges.response == "srgb"
-    assert (watched.camera.width_px, watched.camera.height_px) == (1280, 720)
+    assert (watched.sequence.camera.width_px, watched.sequence.camera.height_px) == (1280, 720)
 
 
 class _Bound:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import stats
 
+from benchmarks import kit
 from benchmarks.noise_model import NoiseModel
 from gripmon.judge.drift import DriftSettings, SequentialTest
 
@@ -62,8 +63,7 @@ class Hotelling:
         self.threshold = threshold
 
     def add(self, shift: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        white = np.linalg.solve(covariance, shift[..., None])[..., 0]
-        return (shift * white).sum(axis=1) / self.threshold
+        return kit.nees(shift, covariance) / self.threshold
 
     def restart(self, streams: np.ndarray) -> None: ...
 

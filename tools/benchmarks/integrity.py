@@ -26,7 +26,7 @@ from benchmarks.integrity_table import BRIEF, COLUMNS
 from benchmarks.kit import Report
 from benchmarks.machine import cores, digest_of
 
-SCENES, FRAMES, QUICK_SCENES = 4, 96, 1
+SCENES, FRAMES = 4, 96
 JUDGED_SCENES = 27
 """Scenes of each condition from which an integrity is judged: some 2,000 in all."""
 _CODE = (
@@ -46,13 +46,12 @@ Key = tuple[Any, ...]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SCENES} scene of each condition")
     parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="conditions with these names")
     parser.add_argument("--list", action="store_true", help="print the names of all conditions and end")
     kit.numbers(
         parser,
-        scenes=(None, f"scenes of each condition (default {SCENES}; {JUDGED_SCENES} to judge by)"),
+        scenes=(SCENES, f"scenes of each condition; {JUDGED_SCENES} to judge by"),
         frames=(FRAMES, "frames of each scene"),
         jobs=(cores(), "scenes at the same time"),
     )
@@ -84,7 +83,7 @@ def run(arguments: argparse.Namespace, report: Report) -> int | None:
     wanted = kit.chosen(arguments.only, names())
     if arguments.picture is not None and importlib.util.find_spec("matplotlib") is None:
         raise kit.Refused("--picture: matplotlib is not installed; tools/bench, or pip install '.[bench]'")
-    scenes = arguments.scenes or (QUICK_SCENES if arguments.quick else SCENES)
+    scenes = arguments.scenes
     others = list(read_lines(arguments.against).values())
     if arguments.against is not None and not others:
         raise kit.Refused(f"--against {arguments.against}: no finished scenes there")
@@ -99,7 +98,7 @@ def run(arguments: argparse.Namespace, report: Report) -> int | None:
     if others:
         _compare(lines, others, report)
     else:
-        integrity_table.show(lines, report)
+        integrity_table.show(lines, report.values, report)
     if arguments.picture is not None:
         from benchmarks import integrity_plots
 
@@ -134,12 +133,11 @@ def _scenes(wanted: list[str], scenes: int, only: int | None) -> Iterator[tuple[
 
 def read_lines(file: Path | None, code: str | None = None) -> dict[Key, Line]:
     """Finished scenes by condition, seed, number, frames and the bound asked for, of some ``code`` or of any; the last
-    of each counts.  Those of before there were two bounds have one error.
+    of each counts.
     """
     out = {}
     for line in kit.kept_lines(file):
         if "code" in line and code in (None, line["code"]):
-            line.setdefault("absolute_error_m", line["error_m"])
             out[*_key(line), line.get("asked_by", "")] = line
     return out
 

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from benchmarks import rendered
+from benchmarks import kit, rendered
 from benchmarks.drawn import reference_record
 from benchmarks.integrity_limits import AlertLimits, frozen_limits
 from benchmarks.integrity_practice import CONDITIONS
@@ -27,9 +27,7 @@ from benchmarks.rendered import Rendered
 from gripmon.belief.core import Believed
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy.judging import NO_REFERENCE
-from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, perturb, perturbation_between, rotation_angle
-from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -78,15 +76,10 @@ class Look:
 
 @dataclass(frozen=True)
 class Watched:
-    """A sequence and what the monitor knows before it."""
+    """A sequence, with what the monitor knows before it, and what it is judged by."""
 
-    camera: Camera
-    gripper: Gripper
-    start_cam_T_grip: Array
+    sequence: IntegrityScene | Rendered
     true_start_cam_T_grip: Array
-    start_covariance: Array
-    jaw_sigma_m: float | None
-    fps: float
     wrong: tuple[Cause, ...]
     inside: bool
     looks: Iterable[Look]
@@ -126,9 +119,10 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
     if valid_by not in ("", BELIEF):
         policy = msgspec.structs.replace(settings.policy, valid_by=msgspec.convert(valid_by, ValidBy))
         settings = msgspec.structs.replace(settings, policy=policy)
-    start = reference_record(watched.start_cam_T_grip, watched.start_covariance, 0)
-    monitor = Monitor(watched.camera, watched.gripper, settings, start, None, shadow=valid_by == BELIEF)
-    truth = Truth(watched.start_cam_T_grip, watched.true_start_cam_T_grip)
+    known = watched.sequence
+    start = reference_record(known.start_cam_T_grip, known.start_covariance, 0)
+    monitor = Monitor(known.camera, known.gripper, settings, start, None, shadow=valid_by == BELIEF)
+    truth = Truth(known.start_cam_T_grip, watched.true_start_cam_T_grip)
     rows: list[dict[str, Any]] = []
     alerts: list[list[Any]] = []
     moved: list[int] = []
@@ -150,7 +144,7 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
         "commit": commit(),
         "grey_dn": grey_dn,
         **_setting(watched, settings),
-        "valid_by": valid_by if valid_by == BELIEF else str(getattr(record, "valid_by", "absolute")),
+        "valid_by": valid_by if valid_by == BELIEF else str(record.valid_by),
         "false_alerts": alerts,
         "moved_alerts": moved,
         "seconds": round(time.perf_counter() - start_s, 2),
@@ -161,12 +155,13 @@ def run_scene(name: str, seed: int, number: int, frames: int, valid_by: str = ""
 
 def _setting(watched: Watched, settings: MonitorSettings) -> dict[str, Any]:
     """What a scene is, apart from its frames."""
+    known = watched.sequence
     return {
-        "gripper": watched.gripper.name,
-        "fps": watched.fps,
-        "depth_m": _short(watched.start_cam_T_grip[2, 3]),
-        "focal_px": _short(watched.camera.fx_px),
-        "jaw_exact": watched.jaw_sigma_m == 0.0,
+        "gripper": known.gripper.name,
+        "fps": known.fps,
+        "depth_m": _short(known.start_cam_T_grip[2, 3]),
+        "focal_px": _short(known.camera.fx_px),
+        "jaw_exact": known.jaw_sigma_m == 0.0,
         "inside": watched.inside,
         "limit_m": settings.policy.alert_limit_m,
         "limit_rad": settings.policy.alert_limit_rad,
@@ -214,20 +209,17 @@ class Truth:
     def of(self, record: FrameRecord, true_cam_T_grip: Array) -> Array:
         """What a record's ``cam_T_grip`` has to be, at the true pose."""
         self.seen[record.stamp_ns] = true_cam_T_grip
-        since = getattr(record, "since_reference", None)
-        if since is None or str(record.valid_by) != "reference":
+        since = record.since_reference
+        if since is None or record.valid_by != "reference":
             return true_cam_T_grip
-        proved = str(since.since) == "first_proved"
+        proved = since.since == "first_proved"
         then = self.seen[since.since_ns] if proved else self.true_start_cam_T_grip
         return perturb(self.reference_cam_T_grip, perturbation_between(then, true_cam_T_grip))
 
 
 def bounds_of(record: FrameRecord) -> dict[str, tuple[float, float] | None]:
-    """Both bounds on position (m) and rotation (rad).  Records of schema 1 have one, which is absolute."""
-    since, absolute = getattr(record, "since_reference", None), getattr(record, "absolute", None)
-    if not hasattr(record, "absolute"):
-        absolute = record.protection
-    named = {"reference": since, "absolute": absolute}
+    """Both bounds on position (m) and rotation (rad)."""
+    named = {"reference": record.since_reference, "absolute": record.absolute}
     return {name: None if b is None else (b.position_m, b.rotation_rad) for name, b in named.items()}
 
 
@@ -253,14 +245,14 @@ def _judged(record: FrameRecord, look: Look, truth: Truth, risk: float) -> dict[
     if record.cam_T_grip is None or record.covariance is None:
         return out
     cam_T_grip = from_record(record.cam_T_grip)
-    measured_T = from_record(getattr(record, "measured_T", None) or record.cam_T_grip)
+    measured_T = from_record(record.measured_T or record.cam_T_grip)
     out["absolute_error_m"] = _short(np.linalg.norm(measured_T[:3, 3] - look.cam_T_grip[:3, 3]))
     error = perturbation_between(cam_T_grip, true_T)
     out["error_m"] = _short(np.linalg.norm(error[:3]))
     out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ true_T[:3, :3]))
     if record.source is not Origin.HELD:
         covariance = np.reshape(record.covariance, (6, 6))
-        out["nees"] = _short(error @ np.linalg.solve(covariance, error))
+        out["nees"] = _short(kit.nees(error, covariance))
         out["floor_m"] = _short(normal_level_m(covariance, risk))
     if record.protection is not None:
         out["level_m"] = _short(record.protection.position_m)
@@ -299,9 +291,10 @@ def _short(value: float) -> float:
 
 def _settings(watched: Watched) -> MonitorSettings:
     """As an integrator sets them up: the alert limits were fixed beforehand."""
-    settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps))
-    if watched.jaw_sigma_m is not None:
-        settings = msgspec.structs.replace(settings, jaw_sigma_m=watched.jaw_sigma_m)
+    known = watched.sequence
+    settings = MonitorSettings(drift=DriftSettings(frames_per_s=known.fps))
+    if known.jaw_sigma_m is not None:
+        settings = msgspec.structs.replace(settings, jaw_sigma_m=known.jaw_sigma_m)
     edges = msgspec.structs.replace(settings.corners.edges, response=watched.response)
     settings = msgspec.structs.replace(settings, corners=msgspec.structs.replace(settings.corners, edges=edges))
     limits = watched.limits
@@ -323,19 +316,12 @@ def _simulated(scene: IntegrityScene) -> Watched:
             yield Look(simulator.frame(index), truth.cam_T_grip, view, enough)
 
     return Watched(
-        simulator.camera,
-        scene.gripper,
-        scene.start_cam_T_grip,
+        scene,
         simulator.truth(scene.first).cam_T_grip,
-        scene.start_covariance,
-        scene.jaw_sigma_m,
-        simulator.scenario.fps,
         condition.wrong,
         scene.first > 0,
         looks(),
-        frozen_limits(
-            _limits_of(scene), scene.jaw_sigma_m == 0.0, _px_per_mm(simulator.camera, scene.start_cam_T_grip)
-        ),
+        _frozen(scene, _limits_of(scene)),
         response=simulator.scenario.sensor.response,
         knock=_knock(scene),
     )
@@ -346,8 +332,9 @@ def _limits_of(scene: IntegrityScene) -> str:
     return Fingers.SHORT.value if scene.condition.fingers is Fingers.SHORT else scene.gripper.name
 
 
-def _px_per_mm(camera: Camera, cam_T_grip: Array) -> float:
-    return 1e-3 * camera.fx_px / float(cam_T_grip[2, 3])
+def _frozen(known: IntegrityScene | Rendered, whose: str) -> AlertLimits:
+    px_per_mm = 1e-3 * known.camera.fx_px / float(known.start_cam_T_grip[2, 3])
+    return frozen_limits(whose, known.jaw_sigma_m == 0.0, px_per_mm)
 
 
 def _knock(scene: IntegrityScene) -> tuple[int, float] | None:
@@ -403,19 +390,10 @@ def _rendered(sequence: Rendered) -> Watched:
             yield Look(shot.frame, shot.cam_T_grip, View.FREE if free else _by_tips(len(tips)), not bent)
 
     return Watched(
-        sequence.camera,
-        sequence.gripper,
-        sequence.start_cam_T_grip,
+        sequence,
         first,
-        sequence.start_covariance,
-        sequence.jaw_sigma_m,
-        sequence.fps,
         (Cause.CAMERA_MOUNT,) * moves + (Cause.FINGER_BENT,) * bent,
         False,
         looks(),
-        frozen_limits(
-            f"rendered {sequence.gripper.name}",
-            sequence.jaw_sigma_m == 0.0,
-            _px_per_mm(sequence.camera, sequence.start_cam_T_grip),
-        ),
+        _frozen(sequence, f"rendered {sequence.gripper.name}"),
     )

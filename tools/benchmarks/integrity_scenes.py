@@ -147,6 +147,14 @@ class IntegrityScene:
     frames: int
 
     @property
+    def camera(self) -> Camera:
+        return self.simulator.camera
+
+    @property
+    def fps(self) -> float:
+        return self.simulator.scenario.fps
+
+    @property
     def indices(self) -> Iterator[int]:
         """The simulator's frames in order."""
         yield from range(self.first, self.first + self.frames)

@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks import kit
 from benchmarks.integrity_limits import POSITIONS_M
-from benchmarks.integrity_stats import VIEWS, by_condition, by_scale, figures, targets, worst
+from benchmarks.integrity_stats import VIEWS, targets
 from benchmarks.kit import Report, percent
 
 Figures = dict[str, Any]
@@ -88,20 +88,20 @@ is, and from then until it is valid; x: not before the end
 - alerts: new ones that name a wrong cause: the mount, another camera, a finger, the opening, the lens"""
 
 
-def show(lines: list[dict[str, Any]], report: Report) -> None:
-    """Everything about the scenes of one run."""
-    total = figures(lines)
-    rows = [[name, *(cell(figures(own)) for cell in COLUMNS.values())] for name, own in by_condition(lines)]
+def show(lines: list[dict[str, Any]], found: Figures, report: Report) -> None:
+    """Everything about the scenes of one run; ``found``: their :func:`benchmarks.integrity_stats.summary`."""
+    total = found["total"]
+    rows = [[name, *(cell(row) for cell in COLUMNS.values())] for name, row in [*found["rows"].items(), ("all", total)]]
     report.say(
         "\n".join(f"- {line}" for line in _about(lines, total)),
         kit.table(("condition", *COLUMNS), rows),
         LEGEND,
-        _scales(lines),
+        _scales(found["scales"]),
         "possible: share of the same frames in which the published covariance alone, with normal errors, would allow a "
         "protection level within the alert limit",
     )
     report.reach(targets(total))
-    report.say("worst frames, one of each scene:", "\n".join(f"- {_again(item)}" for item in worst(lines)))
+    report.say("worst frames, one of each scene:", "\n".join(f"- {_again(item)}" for item in found["worst"]))
 
 
 def _about(lines: list[dict[str, Any]], total: Figures) -> list[str]:
@@ -124,10 +124,10 @@ def _about(lines: list[dict[str, Any]], total: Figures) -> list[str]:
     ]
 
 
-def _scales(lines: list[dict[str, Any]]) -> str:
+def _scales(scales: list[Figures]) -> str:
     """Availability by image scale."""
     rows = []
-    for row in by_scale(lines):
+    for row in scales:
         end = "and more" if math.isinf(row["high"]) else f"to {row['high']:g}"
         jaw = "opening exact" if row["jaw_exact"] else "opening as reported"
         shares = [percent(row[key][view]) for view in range(3) for key in ("available", "possible")]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import chi2, ncx2
 
+from benchmarks import kit
 from benchmarks.offline_images import DISCS, OPENING_M, Setting, gripper
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
@@ -103,7 +104,7 @@ def trials(count: int, seed: int, print_m: float, progress: Callable[[], object]
             result = average([one], inferred=way == "inferred")
             error = perturbation_between(result.cam_T_grip, setting.cam_T_grip)
             errors.error.append(error)
-            errors.nees.append(float(error @ np.linalg.solve(result.covariance, error)))
+            errors.nees.append(float(kit.nees(error, result.covariance)))
             errors.claimed_m.append(np.sqrt(result.covariance.diagonal()[:3]))
         progress()
     return list(found.values())
@@ -182,7 +183,7 @@ def _power(one: Coincidence, true_apart: Array) -> float:
     """0 where tilt and gap can't be determined."""
     if one.apart_covariance is None:
         return 0.0
-    away = float(true_apart @ np.linalg.solve(one.apart_covariance, true_apart))
+    away = float(kit.nees(true_apart, one.apart_covariance))
     return float(ncx2.sf(chi2.isf(REVEALED_P, 3), 3, away)) if away > 0.0 else REVEALED_P
 
 

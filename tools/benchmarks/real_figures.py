@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks import kit
 from benchmarks.real_runs import Part, Run, Still
 from gripmon.model.geometry import make_transform, perturbation_between, rotation_from_xyzw
 from gripmon.model.records import Array
@@ -111,7 +112,7 @@ def _chi2(motion: Array, measured: Sequence[Still]) -> float:
     if not len(motion):
         return math.nan
     covariances = np.array([still.covariance for still in measured]).reshape(-1, 6, 6)
-    return float(np.einsum("ni,ni->n", motion, np.linalg.solve(covariances, motion[:, :, None])[:, :, 0]).mean()) / 6.0
+    return float(kit.nees(motion, covariances).mean()) / 6.0
 
 
 def _beyond(motion: Array, bounds: Array) -> tuple[tuple[float, float], ...]:
