@@ -4,7 +4,7 @@ Runs the monitor, by edges and by corners, over simulated scenes of every condit
 light, jaws, bumps …) and over the rendered sequences beside the checkout, if they are there; compares with the truth:
 errors of the TCP in camera x, y, z (µm) and of the rotation, how often the transform is given, valid, and
 misleading (valid, yet farther off than the alert limit or its own bound), its squared normalised error (NEES, 6 where
-the covariance is true) and the time a frame takes.  A whole run ends with the paper's two series.
+the covariance is true) and the time a frame takes.  The paper's two series are a benchmark of their own.
 
 Systematic errors stay the same within a scene, so each has another pose, jaw opening, gripper (two box fingers, tapered
 fingers, adaptive fingers that move on arcs), light, background and seed.  It starts from a reference that is wrong by
@@ -25,7 +25,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks import accuracy_runs, kit, rendered, series
+from benchmarks import accuracy_runs, kit, rendered
 from benchmarks.accuracy_runs import WAYS, Figures, against_peers, figures, peer_figures, together
 from benchmarks.bound import BOUND_ROW, pose_bound, repeatability
 from benchmarks.conditions import CONDITIONS, FPS, Condition
@@ -81,10 +81,6 @@ def run(arguments: argparse.Namespace, report: Report) -> int | None:
     report.values |= {"seed": arguments.seed, "rows": rows, "together": whole}
     report.say(kit.table(_HEAD, [line for name, row in rows.items() for line in lines(name, row)]))
     report.say("\n".join(f"- {line}" for line in _summary(rows, whole)))
-    if not arguments.only and not arguments.quick:
-        tables = series.tables(arguments.seed)
-        report.values["series"] = tables
-        series.show(tables, report)
     return None
 
 

@@ -45,7 +45,6 @@ class Call:
     they are its children; ``peak_gb``: of all its processes together, pages that they share counted in each.
     """
 
-    engine: str
     workers: int
     begin_s: float
     end_s: float
@@ -135,11 +134,10 @@ def call(
     done = re.search(r"(\d+) measured now", "".join(said))
     if kill_at is None and done is None:
         raise SystemExit(f"gripmon dataset failed:\n{''.join(said[-10:])}")
-    name = "ray" if address else "local"
     used_s = cpu.ru_utime + cpu.ru_stime - _seen_s[0]
     _seen_s[0] += used_s
     return Call(
-        name, workers, begin_s, end_s, stored, float("nan") if address or kill_at else used_s, peak / 1e9,
+        workers, begin_s, end_s, stored, float("nan") if address or kill_at else used_s, peak / 1e9,
         int(done[1]) if done else len(stored), "".join(said[-1:]).strip(),
     )  # fmt: skip
 

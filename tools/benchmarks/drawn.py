@@ -89,11 +89,6 @@ def uniform(low: float, high: float) -> Draw:
     return lambda draft: draft.uniform(low, high)
 
 
-def either_way(low: float, high: float) -> Draw:
-    """Of either sign."""
-    return lambda draft: draft.sign() * draft.uniform(low, high)
-
-
 def whole(low: int, end: int) -> Draw:
     return lambda draft: int(draft.rng.integers(low, end))
 

@@ -31,17 +31,14 @@ Make = Callable[[np.random.Generator], Trial]
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a tenth of the trials")
-    parser.add_argument("--trials", type=kit.count, metavar="N", help="trials a point (default 100)")
-    parser.add_argument(
-        "--honesty-trials", type=kit.count, metavar="N",
-        help="trials a point for bound and coverage, refined only (default six times --trials)",
-    )  # fmt: skip
+    what = "trials a point (default 100); six times as many, refined only, for bound and coverage"
+    parser.add_argument("--trials", type=kit.count, metavar="N", help=what)
     parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
 
 
 def run(arguments: argparse.Namespace, report: Report) -> None:
     seed, trials = arguments.seed, arguments.trials or (10 if arguments.quick else 100)
-    honest = arguments.honesty_trials or 6 * trials
+    honest = 6 * trials
     # The point's place in a figure is its seed; set-ups and noise are the same for each share of wrong spots.
     noise = [("noise_px", px, 1, k, _paper(5, px)) for k, px in enumerate(NOISES_PX)]
     samples = [("samples", 10 * n, 2, k, _paper(n, 0.5)) for k, n in enumerate(ORIENTATIONS)]

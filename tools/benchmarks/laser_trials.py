@@ -31,7 +31,6 @@ OBJECT_M = 0.025 * np.concatenate([np.zeros((1, 3)), *(np.outer([1.0, 2.0, 3.0],
 EE_T_OBJECT = make_transform(
     Rotation.from_euler("ZYX", [-10.0, -20.0, -45.0], degrees=True).as_matrix(), np.array([0.050, -0.020, 0.070])
 )
-LASER_METHODS = ("printed", "common plane", "refined")
 REFERENCE_METHODS = ("Dornaika-Horaud closed", "Dornaika-Horaud refined", "Dornaika-Horaud weighed")
 _LEAST_NOISE_PX = 1e-9
 

@@ -121,11 +121,6 @@ class Noise:
         """(frames, streams, 6, 6) as reported."""
         return self.factor @ np.swapaxes(self.factor, -1, -2)
 
-    @property
-    def sigma(self) -> Array:
-        """(frames, streams, 6) reported standard deviations."""
-        return np.sqrt((self.factor**2).sum(axis=-1))
-
 
 class Streams:
     """A generator of noise; :meth:`next` goes on where the last call ended."""
@@ -143,7 +138,6 @@ class Streams:
         self._scale = _Recursion(model.scale_frames, (count,))
         self._looks = np.array([(*scene.factor, *scene.strength) for scene in model.scenes])
         self._scenes = _Scenes(model.scene_frames, model.move_frames, count, rng)
-        self._first = True
         self._age = 0
         self._lines = None if model.vibration is None else _Lines(model.vibration, model.frames_per_s, count, rng)
         # From a start at zero the slowest part needs some of its correlation times to become stationary.

@@ -4,7 +4,8 @@ Times the daemon's own loop at 60 frames/s with its recording off, on, and on wi
 (a frozen file system of its own as root, else the stopped recording process), in turns, in one run; counts
 bytes an hour by image policy, from half a minute each; writes an hour of recording and times gripmon's
 commands on it; kills a daemon and its recording process 50 times (SIGKILL) and looks what the file lacks.
---only memory: a day's frames through the recorder, as fast as it takes them, and its memory meanwhile.
+--only memory: a day's frames (--quick: three hours') through the recorder, as fast as it takes them, and its memory
+meanwhile.
 Takes some half an hour; --quick, less exact, six minutes.
 """
 
@@ -42,12 +43,7 @@ PARTS = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parts.add_options(parser, "a shorter run")
-    parser.add_argument("--hours", type=float, metavar="H", help="of memory (default 24, --quick 3)")
 
 
 def run(arguments: argparse.Namespace, report: Report) -> int | None:
-    every = dict(PARTS)
-    if arguments.hours is not None:
-        plan = replace(every["memory"].plan, hours=arguments.hours)
-        every["memory"] = replace(every["memory"], plan=plan, quick={})
-    return parts.run(arguments, report, every, unasked=("memory",))
+    return parts.run(arguments, report, PARTS, unasked=("memory",))
