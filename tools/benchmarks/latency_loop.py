@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import harness, kit, machine, scene, stages, tags, visp
 from benchmarks.parts import Measured, Row, skipped
@@ -23,7 +21,6 @@ from gripmon.model.records import Array
 LARGER, TAIL, MEDIAN_MS, LONGEST_MS, GROWN_MIB = 1.3, 3.0, 0.5, 10.0, 2.0
 FASTER = {"clutter": 20.0, "plain": 8.0}
 FASTER_THAN_VISP, UNREPORTED, GONE_MS = 4.0, 3.0, 5.0
-_BAR_STEP = 50
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ def frame(paths: tuple[Path, ...], plan: Plan) -> Measured:
         if seq in (min(1000, plan.frames // 2), plan.settle + plan.frames - 1):
             rss.append(machine.rss_bytes())
 
-    with _progress("frame", plan.settle + plan.frames) as step, harness.on_one_core():
+    with _progress(plan.settle + plan.frames) as step, harness.on_one_core():
         source = harness.RingSource(ring, plan.settle + plan.frames, between=_both(step, look))
         with harness.published(config) as (publisher, subscriber):
             harness.run_loop(config, source, publisher)
@@ -81,7 +78,7 @@ def frame(paths: tuple[Path, ...], plan: Plan) -> Measured:
 def size(paths: tuple[Path, ...], plan: Plan) -> Measured:
     """The same scene at two image sizes, in turns."""
     small, large = (_scene(path) for path in paths)
-    ms, _ = _in_turns("size", plan, {"small": (*small, {}), "large": (*large, {})})
+    ms, _ = _in_turns(plan, {"small": (*small, {}), "large": (*large, {})})
     ratio = float(np.median(ms["large"]) / np.median(ms["small"]))
     text = f"{np.median(ms['large']):.3g} ms, smaller {np.median(ms['small']):.3g} ms"
     return Measured((Row("1920 x 1080 over 768 x 576, median", ratio, "times", LARGER, note=text),))
@@ -100,7 +97,7 @@ def against_tags(paths: tuple[Path, ...], plan: Plan, kind: str) -> Measured:
         if tcp_m is not None:
             errors_m.append(float(np.linalg.norm(tcp_m - ring.true_tcp_m[place])))
 
-    ms = _beside(kind, config, ring, plan, beside)
+    ms = _beside(config, ring, plan, beside)
     other = harness.summary(1e-3 * np.array(times_us))
     return Measured(
         (
@@ -133,7 +130,7 @@ def against_visp(paths: tuple[Path, ...], plan: Plan) -> Measured:
                 if tcp_m is not None:
                     errors_m.append(float(np.linalg.norm(tcp_m - ring.true_tcp_m[place])))
 
-            ms = _beside("visp", config, ring, plan, beside)
+            ms = _beside(config, ring, plan, beside)
     other = harness.summary(1e-3 * np.array(times_us))
     followed = sum(error_m < 2e-3 for error_m in errors_m)
     return Measured(
@@ -147,7 +144,7 @@ def unreported(paths: tuple[Path, ...], plan: Plan) -> Measured:
     """The same frames with the jaw opening and without it, in turns."""
     config, ring = _scene(paths[0])
     runs = {"reported": (config, ring, {}), "unreported": (config, ring, {"opening": False})}
-    ms, measured = _in_turns("unreported", plan, runs)
+    ms, measured = _in_turns(plan, runs)
     medians = {name: float(np.median(values)) for name, values in ms.items()}
     note = f"{medians['unreported']:.3g} ms, reported {medians['reported']:.3g} ms"
     ratio = medians["unreported"] / medians["reported"]
@@ -160,7 +157,7 @@ def unreported(paths: tuple[Path, ...], plan: Plan) -> Measured:
 def gone(paths: tuple[Path, ...], plan: Plan, kind: str) -> Measured:
     """At the camera's rate on any core, as the daemon runs: searches go on beside the frames."""
     config, ring = _scene(paths[0])
-    with _progress(kind, plan.gone) as step:
+    with _progress(plan.gone) as step:
         source = harness.RingSource(ring, plan.gone, paced=True, between=step)
         with harness.published(config) as (publisher, _):
             harness.run_loop(config, source, publisher)
@@ -201,7 +198,7 @@ def _staged(path: Path, plan: Plan, *, gone: bool) -> dict[str, float]:
     config, ring = _scene(path)
     count = plan.settle + (max(plan.staged // 4, 2 * len(ring)) if gone else plan.staged)
     counted = [seq >= plan.settle and bool(ring.gone[ring.place(seq)]) == gone for seq in range(count)]
-    with harness.on_one_core(), stages.stop_watches() as watches, _progress("profile", count) as step:
+    with harness.on_one_core(), stages.stop_watches() as watches, _progress(count) as step:
 
         def begin(seq: int) -> None:
             watches.counting = counted[seq]
@@ -218,9 +215,7 @@ def _scene(path: Path) -> tuple[Config, scene.Ring]:
     return scene.config_for(ring.size), ring
 
 
-def _beside(
-    title: str, config: Config, ring: scene.Ring, plan: Plan, beside: Callable[[int], None]
-) -> dict[str, float]:
+def _beside(config: Config, ring: scene.Ring, plan: Plan, beside: Callable[[int], None]) -> dict[str, float]:
     """Ours on one core, ms; ``beside`` is called with places of the ring between blocks."""
 
     def between(seq: int) -> None:
@@ -228,7 +223,7 @@ def _beside(
             for place in map(ring.place, range(seq, seq + plan.beside)):
                 beside(place)
 
-    with _progress(title, plan.settle + plan.compared) as step, harness.on_one_core():
+    with _progress(plan.settle + plan.compared) as step, harness.on_one_core():
         source = harness.RingSource(ring, plan.settle + plan.compared, between=_both(step, between))
         with harness.published(config) as (publisher, _):
             harness.run_loop(config, source, publisher)
@@ -236,13 +231,13 @@ def _beside(
 
 
 def _in_turns(
-    title: str, plan: Plan, runs: dict[str, tuple[Config, scene.Ring, dict[str, Any]]]
+    plan: Plan, runs: dict[str, tuple[Config, scene.Ring, dict[str, Any]]]
 ) -> tuple[dict[str, Array], dict[str, float]]:
     """Each run for some seconds, in turns, on one core: times, ms, and the share of frames that were measured."""
     ms: dict[str, list[Array]] = {name: [] for name in runs}
     measured: dict[str, list[float]] = {name: [] for name in runs}
     with contextlib.ExitStack() as opened:
-        step = opened.enter_context(_progress(title, plan.turns * len(runs) * (plan.settle + plan.turn)))
+        step = opened.enter_context(_progress(plan.turns * len(runs) * (plan.settle + plan.turn)))
         opened.enter_context(harness.on_one_core())
         publishers = {name: opened.enter_context(harness.published(run[0]))[0] for name, run in runs.items()}
         for _ in range(plan.turns):
@@ -255,15 +250,10 @@ def _in_turns(
 
 
 @contextlib.contextmanager
-def _progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
     """A bar; what is yielded is called before each frame."""
-    with tqdm(total=total, desc=title, unit="frame", file=sys.stderr, disable=None, leave=False) as bar:
-
-        def step(seq: int) -> None:
-            if seq and seq % _BAR_STEP == 0:
-                bar.update(_BAR_STEP)
-
-        yield step
+    with kit.bar("frame", total) as bar:
+        yield lambda _: bar.update()
 
 
 def _both(*calls: Callable[[int], None]) -> Callable[[int], None]:
