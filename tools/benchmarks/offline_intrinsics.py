@@ -125,17 +125,18 @@ def on_photographs(folder: Path, board: Chequerboard) -> list[Photographs]:
     out = []
     for who, of in points.items():
         shared = [found for k in common if (found := of[k])]
-        left = _residual_px(shared, images[0].shape) if len(shared) >= FEWEST_PHOTOGRAPHS else float("nan")
-        out.append(Photographs(who, len(images), sum(found is not None for found in of), len(common), left))
+        left = _fitted(shared, images[0].shape[::-1])[0] if len(shared) >= FEWEST_PHOTOGRAPHS else float("nan")
+        found_in = sum(found is not None for found in of)
+        out.append(Photographs(who, len(images), found_in, len(common), left / np.sqrt(2.0)))
     return out
 
 
-def _residual_px(points: Points, shape: tuple[int, ...]) -> float:
-    plates = [plate.astype(np.float32) for plate, _ in points]
-    uv = [px.reshape(-1, 1, 2).astype(np.float32) for _, px in points]
-    size = (shape[1], shape[0])
-    rms, *_ = cv2.calibrateCamera(plates, uv, size, None, None, flags=cv2.CALIB_FIX_K3)  # type: ignore[call-overload]
-    return float(rms) / np.sqrt(2.0)
+def _fitted(points: Points, size: tuple[int, int]) -> tuple[float, Array, Array]:
+    """By OpenCV, of images (width, height): what is left (root mean square, px), the camera's matrix, the lens."""
+    plates = [plate.astype(np.float32).reshape(-1, 1, 3) for plate, _ in points]
+    uv = [px.astype(np.float32).reshape(-1, 1, 2) for _, px in points]
+    rms, matrix, lens, *_ = cv2.calibrateCamera(plates, uv, size, None, None, flags=cv2.CALIB_FIX_K3)
+    return float(rms), matrix, lens
 
 
 def _searched(find: Callable[[NDArray[np.uint8]], Any], view: View, count: Found) -> Any:
@@ -241,10 +242,7 @@ def _gripmon(sightings: list[Sighting]) -> tuple[Array, float]:
 
 
 def _calibrate_camera(points: Points) -> Array:
-    plate = [p.astype(np.float32).reshape(-1, 1, 3) for p, _ in points]
-    uv = [q.astype(np.float32).reshape(-1, 1, 2) for _, q in points]
-    size = (LENS.width_px, LENS.height_px)
-    _, matrix, lens, *_ = cv2.calibrateCamera(plate, uv, size, None, None, flags=cv2.CALIB_FIX_K3)
+    _, matrix, lens = _fitted(points, (LENS.width_px, LENS.height_px))
     coefficients = np.ravel(lens)[:4]
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients])
 
