@@ -44,9 +44,7 @@ def write_config(path: Path, size: tuple[int, int]) -> None:
     (w, h), scale = size, size[0] / _WIDTH_PX
     gripper = builtin_config("grippers/two_box_fingers.yaml")
     path.write_text(
-        _CONFIG.format(
-            w=w, h=h, f=_FOCAL_PX * scale, cx=(w - 1) / 2, cy=(h - 1) / 2, gripper=gripper, opened=_OPEN_M
-        )
+        _CONFIG.format(w=w, h=h, f=_FOCAL_PX * scale, cx=(w - 1) / 2, cy=(h - 1) / 2, gripper=gripper, opened=_OPEN_M)
     )
 
 

@@ -108,7 +108,6 @@ class _TimedPublisher(Output):
     def event(self, event: Event) -> None:
         self._inner.event(event)
 
-
     def close(self) -> None: ...
 
 
