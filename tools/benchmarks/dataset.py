@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks import kit
+from benchmarks import kit, machine
 from benchmarks.dataset_set import render, write_config, write_damaged, write_set
 from benchmarks.kit import Report
 from gripmon.analyse.dataset import Results, write_table
@@ -113,7 +113,7 @@ def call(
     command = [sys.executable, "-m", "gripmon", "dataset", str(folder / dataset), "--config", str(folder / "c.yaml")]
     command += ["--out", str(to)]
     command += ["--engine", "ray", "--address", address] if address else ["--workers", str(workers)]
-    begin_s, peak = time.time(), 0
+    begin_s, before_s, peak = time.time(), machine.children_s(), 0
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     said: list[str] = []
     reader = threading.Thread(target=lambda: said.extend(process.stderr or ()), daemon=True)
@@ -129,21 +129,15 @@ def call(
         time.sleep(_LOOK_S)
     end_s = time.time()
     reader.join()
-    cpu = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used_s = machine.children_s() - before_s
     stored = [path.stat().st_mtime for path in set(to.glob("episodes-*/*.parquet")) - before]
     done = re.search(r"(\d+) measured now", "".join(said))
     if kill_at is None and done is None:
         raise SystemExit(f"gripmon dataset failed:\n{''.join(said[-10:])}")
-    used_s = cpu.ru_utime + cpu.ru_stime - _seen_s[0]
-    _seen_s[0] += used_s
     return Call(
         workers, begin_s, end_s, stored, float("nan") if address or kill_at else used_s, peak / 1e9,
         int(done[1]) if done else len(stored), "".join(said[-1:]).strip(),
     )  # fmt: skip
-
-
-_seen_s = [0.0]
-"""Processor time of this process's children so far."""
 
 
 def _memory(root: Any) -> int:

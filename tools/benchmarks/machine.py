@@ -60,6 +60,12 @@ def rss_bytes(pid: int | str = "self") -> int:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
+def children_s() -> float:
+    """Processor time of the processes that this one started and that have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
 def _cpu_name() -> str:
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith("model name"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import os
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from typing import Any
 import cv2
 import msgspec
 
-from benchmarks import parts, scene
+from benchmarks import machine, parts, scene, switched
 from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.files import FileSeries
@@ -77,14 +76,7 @@ def write(quiet: Path, moving: Path, directory: Path, plan: Plan) -> dict[str, A
     cv2.setNumThreads(1)
     calm_ring, busy_ring = scene.Ring.load(quiet), scene.Ring.load(moving)
     config = scene.config_for(calm_ring.size)
-    settings = msgspec.structs.replace(
-        config.settings.recording, min_free_bytes=0, budget_bytes=0, max_file_s=1e9, max_file_bytes=1 << 40
-    )
-    described = Scene(
-        name="hour", directory=str(directory), settings=settings, robot=config.settings.robot,
-        camera=config.settings.camera_name, lens=config.camera.settings, gripper=config.gripper.model,
-        reference=config.reference,
-    )  # fmt: skip
+    described = switched.described(config, directory, budget_bytes=0, max_file_s=1e9, max_file_bytes=1 << 40)
     calm, busy = _judge(calm_ring, plan.quiet), _judge(busy_ring, plan.moving)
     start_s = time.monotonic()
     images = _write(described, _sequence(calm.rows, busy.rows, plan.frames), plan)
@@ -180,19 +172,14 @@ def read(directory: Path, plan: Plan) -> dict[str, Any]:
 def _timed(name: str, files: list[str], directory: Path, plan: Plan) -> dict[str, Any]:
     arguments = [str(directory / part) if part[0] != "-" else part for part in COMMANDS[name]]
     start_s = time.monotonic()
-    before_s = os.times().children_user + os.times().children_system
+    before_s = machine.children_s()
+    command = [sys.executable, "-m", "gripmon", name, *files, *arguments]
     with contextlib.suppress(subprocess.TimeoutExpired):
-        done = _gripmon(name, *files, *arguments, timeout_s=plan.timeout_s)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=plan.timeout_s, check=False)
         return {
             "took_s": time.monotonic() - start_s,
-            "cpu_s": os.times().children_user + os.times().children_system - before_s,
+            "cpu_s": machine.children_s() - before_s,
             "code": done.returncode,
             "said": (done.stdout + done.stderr).strip()[-400:],
         }
     return {"took_s": math.inf, "cpu_s": math.nan, "code": None, "said": f"not done after {plan.timeout_s:g} s"}
-
-
-def _gripmon(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gripmon", *arguments], capture_output=True, text=True, timeout=timeout_s, check=False
-    )

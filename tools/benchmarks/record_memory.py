@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from benchmarks import kit, machine, scene
 from benchmarks.parts import Measured, Row
+from benchmarks.switched import described
 from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 from gripmon.monitor import Monitor
-from gripmon.record.write import ProcessRecorder, open_recorder
+from gripmon.record.write import ProcessRecorder
 
 SIZE = (384, 288)
 FLAT_MIB = 1.0
@@ -28,7 +29,6 @@ _LIGHT = {
     "around_alert_s": 0.0,
     "max_file_bytes": 20_000_000,
     "budget_bytes": 80_000_000,
-    "min_free_bytes": 0,
 }
 
 
@@ -52,12 +52,7 @@ def measure(paths: tuple[Path, ...], plan: Plan) -> Measured:
     judged = [_judge(monitor, ring.frame(seq)) for seq in range(plan.judged)]
     count = round(plan.hours * FRAMES_PER_HOUR)
     with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as directory:
-        recorder = open_recorder(
-            msgspec.structs.replace(config.settings.recording, **_LIGHT),
-            robot=config.settings.robot, camera_name=config.settings.camera_name, camera=config.camera,
-            gripper=config.gripper, reference=config.reference, directory=Path(directory), patience_s=30.0,
-        )  # fmt: skip
-        assert isinstance(recorder, ProcessRecorder)
+        recorder = ProcessRecorder(described(config, Path(directory), **_LIGHT), patience_s=30.0)
         start_s = time.monotonic()
         looks = _push(recorder, judged, count, plan.look_every)
         took_s = time.monotonic() - start_s

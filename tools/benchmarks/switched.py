@@ -8,62 +8,36 @@ from typing import Any
 import msgspec
 
 from gripmon.daemon.config import Config
-from gripmon.model.outputs import Event, Notes, Trace
+from gripmon.model.outputs import Notes, Trace
 from gripmon.model.records import Frame, FrameRecord
-from gripmon.record.recorder import Recorder
-from gripmon.record.write import ProcessRecorder, open_recorder
+from gripmon.record.recorder import Scene
+from gripmon.record.write import ProcessRecorder
 
 
-class SwitchedRecorder(Recorder):
-    """The product's recorder while ``on``, with its default settings but for ``changes``; idle while off."""
+def described(config: Config, directory: Path, **changes: Any) -> Scene:
+    """What a recording process is told, with the default settings but for ``changes``; a full disk doesn't stop it."""
+    settings = config.settings
+    return Scene(
+        name="bench", directory=str(directory), robot=settings.robot, camera=settings.camera_name,
+        settings=msgspec.structs.replace(settings.recording, min_free_bytes=0, **changes),
+        lens=config.camera.settings, gripper=config.gripper.model, reference=config.reference,
+    )  # fmt: skip
+
+
+class SwitchedRecorder(ProcessRecorder):
+    """The product's recorder while ``on``; idle while off."""
 
     def __init__(self, config: Config, directory: Path, **changes: Any) -> None:
         self.on = False
         self._offered = 0
-        inner = open_recorder(
-            msgspec.structs.replace(config.settings.recording, min_free_bytes=0, **changes),
-            robot=config.settings.robot,
-            camera_name=config.settings.camera_name,
-            camera=config.camera,
-            gripper=config.gripper,
-            reference=config.reference,
-            directory=directory,
-        )
-        assert isinstance(inner, ProcessRecorder)
-        self._inner = inner
-
-    @property
-    def dropped(self) -> int:
-        return self._inner.dropped
-
-    @property
-    def images_dropped(self) -> int:
-        return self._inner.images_dropped
-
-    @property
-    def has_room(self) -> bool:
-        return self._inner.has_room
+        super().__init__(described(config, directory, **changes))
 
     @property
     def waiting(self) -> int:
         """Frames that were taken and are not yet written."""
-        return self._offered - self._inner.frames_written - self._inner.dropped
-
-    @property
-    def process_id(self) -> int | None:
-        return self._inner.process_id
-
-    @property
-    def failure(self) -> str | None:
-        return self._inner.failure
+        return self._offered - self.frames_written - self.dropped
 
     def frame(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         if self.on:
             self._offered += 1
-            self._inner.frame(frame, record, trace, notes)
-
-    def event(self, event: Event) -> None:
-        self._inner.event(event)
-
-    def close(self, timeout_s: float = 5.0) -> None:
-        self._inner.close(timeout_s)
+            super().frame(frame, record, trace, notes)
