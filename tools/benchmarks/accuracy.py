@@ -53,7 +53,7 @@ _HEAD = (
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help=f"{_QUICK_SCENES} scenes of each condition")
     parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="rows whose name starts so")
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="rows with these names")
     parser.add_argument("--list", action="store_true", help="print the names of all rows and end")
     kit.numbers(
         parser,
@@ -68,10 +68,7 @@ def run(arguments: argparse.Namespace, report: Report) -> int | None:
     if arguments.list:
         print("\n".join(row_names()))
         return 0
-    for name in arguments.only:
-        if not any(row.startswith(name) for row in row_names()):
-            raise kit.Refused(f"--only {name}: there is no such row; one of {', '.join(row_names())}")
-    names = [name for name in row_names() if not arguments.only or name.startswith(tuple(arguments.only))]
+    names = kit.chosen(arguments.only, row_names())
     scenes = arguments.scenes or (_QUICK_SCENES if arguments.quick else None)
     report.say(f"seed {arguments.seed}; {arguments.jobs} rows at the same time, one thread each", LEGEND)
     tasks = [(name, scenes, arguments.frames, arguments.seed, not arguments.no_peers) for name in names]

@@ -64,11 +64,11 @@ class Outcome:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=kit.count, default=1, metavar="N", help="of everything random (default 1)")
     kit.numbers(parser, trials=(200, "of each cause"))
-    parser.add_argument("--only", metavar="ROWS", default="", help="rows, separated by commas (default: all)")
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="rows with these names")
 
 
 def run(arguments: argparse.Namespace, report: Report) -> None:
-    rows = kit.chosen([name for name in arguments.only.split(",") if name], ROWS)
+    rows = kit.chosen(arguments.only, ROWS)
     # The rows in turn, so that a part of the trials tells about all of them.
     work = [(name, number) for number in range(arguments.trials) for name in rows]
     outcomes = []
