@@ -198,7 +198,7 @@ def failed(arguments: list[str], capsys) -> tuple[int, str]:
     ("out", "stamps", "says"),
     [
         ("c.txt", None, "one of .jsonl, .parquet, .rrd"),
-        ("estimates.jsonl", None, "another file"),
+        ("estimates.jsonl", None, "different files"),
         ("c.rrd", "stamp_ns\n1\n", "--stamps"),
         ("c.jsonl", "time\n1\n", "no column stamp_ns"),
         ("c.jsonl", "stamp_ns\n12.5\n", "line 2: '12.5'"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
@@ -81,7 +79,7 @@ def test_a_creep_says_how_fast_and_how_long_until_the_limit():
 @pytest.mark.parametrize(("since_first", "where"), [(False, "the reference"), (True, "the first frames")])
 def test_a_motion_says_from_where_its_size_counts(since_first: bool, where: str):
     run = settled()
-    [alert] = run.feed(replace(seen(0.5), since_first=since_first)).alerts
+    [alert] = run.feed(seen(0.5)._replace(since_first=since_first)).alerts
     at = f"at {run.now_s:.1f} s of the images' clock the TCP was"
     assert alert.text.startswith(f"a step: {at} +0.500 +0.000 +0.000 mm from where {where} had it (1 sigma")
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from gripmon.model.camera import LensSettings, make_camera
@@ -48,7 +46,7 @@ class NoisyMeter(ForecastMeter):
         offset_px = jacobian @ to_truth + self.rng.normal(scale=EDGE_POINT_SIGMA_PX, size=len(jacobian))
         lost = self.rng.random(len(offset_px)) < self.gross
         offset_px[lost] = self.rng.uniform(-_GROSS_PX, _GROSS_PX, np.count_nonzero(lost))
-        return dataclasses.replace(edgels, candidates=dataclasses.replace(edgels.candidates, offset_px=offset_px))
+        return edgels._replace(candidates=edgels.candidates._replace(offset_px=offset_px))
 
     def _assess(self, edgels: Edgels, consensus: RobustFit) -> Uncertainty:
         """As for an image: by what the points show."""
