@@ -342,7 +342,7 @@ def join(
     """One more measurement of a pose, as in a Kalman filter; the trace of its gain.  With P = ``before`` (6, 6), the
     covariance R of what was ``measured`` and the gain K = P (P + R)^-1, ``out`` is mean + K (shift - mean) (6,), the
     covariance K R (6, 6) and the errors by the model off + K (of_model - off) (f, 6), ``off`` (f or 1, 6).
-    ``work`` (5, 6, 6) is overwritten.
+    ``work`` (4, 6, 6) is overwritten.
 
     P, R or both may leave directions open: a product of K and R, large each, has lost the other directions' digits.
     With the smaller one C of P and R, L L' = P + R and V = L^-1 C, K R is C - V' V, and K' is L'^-1 V: symmetric, no
@@ -487,7 +487,7 @@ def after_jumps(
     """
     count, parts = len(fit), off.shape[1]
     shifts, covariances, offs = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, parts, 6))
-    before, work = np.empty((6, 6)), np.empty((5, 6, 6))
+    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
     for r in range(count):
         if probability[r] <= share:
             continue
@@ -561,7 +561,7 @@ def follow(
     """
     count = len(mean)
     new_mean, new_covariance, new_off, taken = mean.copy(), covariance.copy(), off.copy(), np.empty(count)
-    before, work = np.empty((6, 6)), np.empty((5, 6, 6))
+    before, work = np.empty((6, 6)), np.empty((4, 6, 6))
     for g in range(count):
         for i in range(6):
             for j in range(6):
@@ -577,7 +577,7 @@ def with_known(shift: Array, covariance: Array, off: Array, at: Array, known: Ar
     of all of them besides: ``at`` (6,) but for a covariance ``known`` (6, 6).
     """
     new_shift, new_covariance, new_off = shift.copy(), covariance.copy(), off.copy()
-    none, work = np.zeros((off.shape[1], 6)), np.empty((5, 6, 6))
+    none, work = np.zeros((off.shape[1], 6)), np.empty((4, 6, 6))
     for h in range(len(shift)):
         out = new_shift[h], new_covariance[h], new_off[h]
         join(shift[h], covariance[h], off[h], (at, known, none), out, work)

@@ -333,7 +333,7 @@ def moved(
     errors = parts + kinds * kinds + kinds
     half, none = np.empty((6, 6)), np.zeros((0, 6))
     way, scatter, error = np.empty(6), np.empty((6, 6)), np.empty((errors, 6))
-    joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((5, 6, 6))
+    joined, work = (np.empty(6), np.empty((6, 6)), np.empty((errors, 6))), np.empty((4, 6, 6))
     exact, true_way, unsure = np.zeros((errors, 6)), np.empty(6), np.empty((6, 6))
     for r in range(len(prior)):
         g, number = which[r], first + r
