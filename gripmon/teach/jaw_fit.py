@@ -33,7 +33,7 @@ from gripmon.teach.image_motion import FingerMoved, JawMotion, Unfit
 from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_unknowns import STATIONS, Jaws
 from gripmon.teach.piece_lines import LEAST_SCATTER_PX, STRAIGHT_PX
-from gripmon.teach.silhouette import FROM_BORDER_PX, Stations, in_image, lines_in_image, measure_transitions
+from gripmon.teach.silhouette import FROM_BORDER_PX, NARROW_PX, in_image, measure_transitions, stations_ahead
 from gripmon.teach.straight_pieces import LONGEST_CUT_PX
 from gripmon.teach.vanishing import Outline
 
@@ -247,19 +247,15 @@ class _Fit(Jaws):
         ahead = np.asarray(np.gradient(points.reshape(-1, STATIONS, 3), axis=1)).reshape(-1, 3)
         ways = self.camera.project(points + 1e-3 * ahead)
         uv = np.nan_to_num(self.camera.project(points), nan=-1e3)
-        way = ways - uv
-        way /= np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
-        across = np.column_stack([-way[:, 1], way[:, 0]])
-        inside = lines_in_image(uv, across, self.shape_px)
-        # A station's normal points away from the finger: going along its outline that is on the left in the image.
-        stations = Stations(uv, across, inside)
+        stations = stations_ahead(uv, ways, self.shape_px, NARROW_PX)
         seen = other.matte.images, stations, other.matte.noise
         got = measure_transitions(*seen, wide=wide, blur_px=self.blur_px)
         met = np.flatnonzero(got.usable)
         if len(met) < 0.5 * len(matched[0]):
             return matched
-        at_px = uv[met] + across[met] * got.offset_px[met, None]
-        at, aside = (self.camera.undistort(at_px + k * across[met]) for k in (0.0, 0.5))
+        across = stations.normal[met]
+        at_px = uv[met] + across * got.offset_px[met, None]
+        at, aside = (self.camera.undistort(at_px + k * across) for k in (0.0, 0.5))
         normal = (aside - at) / np.linalg.norm(aside - at, axis=1)[:, None]
         return met, at, normal
 

@@ -18,7 +18,7 @@ from gripmon.teach.image_outline import OpeningSeen
 from gripmon.teach.jaw_fit import AGREEING
 from gripmon.teach.motion_depth import Moved, move
 from gripmon.teach.piece_lines import WORST_SIGMA_PX, jackknife_sigma
-from gripmon.teach.silhouette import WIDE_PX, WIDE_SEARCH_PX, Stations, lines_in_image, measure_transitions
+from gripmon.teach.silhouette import WIDE_PX, WIDE_SEARCH_PX, Stations, measure_transitions, stations_ahead
 from gripmon.teach.vanishing import Outline
 
 FEWEST_STATIONS = 4
@@ -106,30 +106,25 @@ def _beside_px(camera: Camera, ends: Array, seen: OpeningSeen, blur_px: float) -
     if not (np.isfinite(ends).all() and (ends[:, 2] > 0.0).all()):
         return None
     matte, shape = seen.matte, seen.matte.still.shape
-    uv, normal = _stations(camera, ends)
-    inside = lines_in_image(uv, normal, shape, WIDE_PX)
-    stations = Stations(uv, normal, inside)
+    stations = _stations(camera, ends, shape)
     found = measure_transitions(matte.images, stations, matte.noise, wide=True, blur_px=blur_px)
     across = np.arange(-WIDE_SEARCH_PX, WIDE_SEARCH_PX + 0.5)[:, None, None]
-    column, row = np.moveaxis(np.rint(uv + across * normal).astype(int), 2, 0)
+    column, row = np.moveaxis(np.rint(stations.uv_px + across * stations.normal).astype(int), 2, 0)
     still = matte.still[np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)]
-    gone = inside & ~found.usable & ~still.any(axis=0)
+    gone = stations.inside & ~found.usable & ~still.any(axis=0)
     known = (found.usable & (jackknife_sigma(found.folds_px) < WORST_SIGMA_PX)) | gone
     if np.count_nonzero(known) < FEWEST_STATIONS:
         return None
     return float(np.median(np.where(gone, WIDE_SEARCH_PX, np.abs(found.offset_px))[known]))
 
 
-def _stations(camera: Camera, ends: Array) -> tuple[Array, Array]:
-    """Points (s, 2) a pixel apart on an edge's image, and normals (s, 2) away from the gripper, which is on the left
-    going along it.
-    """
+def _stations(camera: Camera, ends: Array, shape: tuple[int, ...]) -> Stations:
+    """Stations a pixel apart on the image of an edge with ends (2, 3)."""
     xy = ends[:, :2] / ends[:, 2:]
     count = max(round(camera.fx_px * float(np.linalg.norm(xy[1] - xy[0]))), 1)
     share = (np.arange(count) + 0.5)[:, None] / count
     uv, ahead = (camera.distort(xy[0] + part * (xy[1] - xy[0])) for part in (share, share + 1e-3))
-    way = (ahead - uv) / np.linalg.norm(ahead - uv, axis=1)[:, None]
-    return uv, np.column_stack([-way[:, 1], way[:, 0]])
+    return stations_ahead(uv, ahead, shape, WIDE_PX)
 
 
 def _share_left(outlines: Sequence[Outline], placed: PlacedOutlines, wrong: Sequence[Pieces]) -> float:

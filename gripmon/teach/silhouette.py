@@ -121,6 +121,16 @@ def stations_along(contour: Array, still: NDArray[np.bool_]) -> Stations:
     return Stations(contour, normal, lines_in_image(contour, normal, still.shape, WIDE_PX))
 
 
+def stations_ahead(uv_px: Array, ahead_px: Array, shape: tuple[int, ...], reach_px: float) -> Stations:
+    """Stations at points (s, 2) of an outline that leads on to others (s, 2), the gripper on its left; so their normals
+    point away from it.
+    """
+    way = ahead_px - uv_px
+    way /= np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+    normal = np.column_stack([-way[:, 1], way[:, 0]])
+    return Stations(uv_px, normal, lines_in_image(uv_px, normal, shape, reach_px))
+
+
 def inner_side(uv_px: Array, normal: Array, still: NDArray[np.bool_]) -> Array:
     """Positive (n,) where the normals (n, 2) point into a mask."""
     soft = cv2.GaussianBlur(still.astype(np.float32), (0, 0), 2.0)
