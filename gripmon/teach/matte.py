@@ -333,7 +333,9 @@ def _halves(features: Plane) -> list[bool]:
     for start in (order < count // 2, order % 2 == 0, *(vector > np.median(vector) for vector in vectors)):
         there = _settled(features, start)
         sets = [own for own in (there, ~there) if np.count_nonzero(own) >= FEWEST_IMAGES]
-        stays = sum(np.count_nonzero(own) * float(_staying(features[own]).sum()) for own in sets)
+        stays = sum(
+            own.sum() * float(_beyond_chance(*_resultant(features[own]), 1.0 / own.sum()).sum()) for own in sets
+        )
         if len(sets) == 2 and stays > most:
             best, most = there, stays
     return best.tolist()
@@ -348,8 +350,10 @@ def _settled(features: Plane, there: Bits) -> Bits:
             size = np.count_nonzero(own)
             if size < 2:
                 return there
-            mean, stays = features[own].mean(axis=0), _staying(features[own])
-            share = np.sqrt(stays / np.maximum(np.square(mean).sum(axis=0), 1e-12))
+            mean = features[own].mean(axis=0)
+            square = np.square(mean).sum(axis=0)
+            stays = _beyond_chance(square, squares[own].mean(axis=0), 1.0 / size)
+            share = np.sqrt(stays / np.maximum(square, 1e-12))
             shown[side] = np.tensordot(features, share * mean, 3)
             # Without what an image itself adds to its set's mean.
             itself = np.tensordot(squares, share, 2)
@@ -360,12 +364,6 @@ def _settled(features: Plane, there: Bits) -> Bits:
             break
         there = then
     return there
-
-
-def _staying(features: Plane) -> Plane:
-    """Square of the mean direction (h, w) over images (n, 2, h, w), beyond three times what chance makes it."""
-    mean, each = _resultant(features)
-    return np.maximum(mean - 3.0 / len(features) * each, 0.0)
 
 
 def _directions(image: Plane) -> Plane:
@@ -393,8 +391,13 @@ def _differ(features: Plane, one: list[int], other: list[int]) -> bool:
         usual = float(np.median(mean[at] / each[at])) if at.any() else 0.0
         # Random directions' squared mean is exponentially distributed, so that its median is ln 2 of its mean.
         chance = max(usual / math.log(2.0), 1.0 / len(own))
-        energies.append(float(np.maximum(mean - 3.0 * chance * each, 0.0).sum()))
+        energies.append(float(_beyond_chance(mean, each, chance).sum()))
     return min(energies[:2]) > energies[2]
+
+
+def _beyond_chance(mean: Plane, each: Plane, chance: float) -> Plane:
+    """What squares of mean directions (h, w) have beyond three times what chance makes of the squares of ``each``."""
+    return np.maximum(mean - 3.0 * chance * each, 0.0)
 
 
 def _resultant(features: Plane) -> tuple[Plane, Plane]:
