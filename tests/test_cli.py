@@ -366,3 +366,29 @@ def test_what_a_command_reads_is_not_its_output(
     assert main(words) == 2
     assert capsys.readouterr().err.endswith(f"{input_option} and --out: both are {Path(words[-1])}; different files\n")
     assert Path("kept.yaml").read_text() == shipped()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["report", "run", "--out", "run/a.rrd"], "is there already, in a folder that is read; another file"),
+        (["report", "run", "--out", "notes.txt"], "has no known ending; .html"),
+        (["correct", "run", "--out", "run/a.jsonl"], "is there already, in a folder that is read; another file"),
+        (["replay", "images", "--out", "images/0.png"], "is there already, in a folder that is read; another file"),
+        (["replay", "images", "--out", "-", "--recording", "notes.txt"], "has no known ending; .rrd"),
+    ],
+)
+def test_what_lies_in_a_folder_that_is_read_is_not_replaced(
+    words: list[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    Path("run").mkdir()
+    Path("images").mkdir()
+    cv2.imwrite("images/0.png", np.zeros((576, 768), np.uint8))
+    Path("config.yaml").write_text(shipped())
+    for kept in ("run/a.rrd", "run/a.jsonl", "notes.txt"):
+        Path(kept).write_text("kept")
+    before = Path(words[-1]).read_bytes()
+    assert main([*words, *(["--config", "config.yaml"] if words[0] == "replay" else [])]) == 2
+    assert capsys.readouterr().err.endswith(f"{words[-2]} {Path(words[-1])}: {why}\n")
+    assert Path(words[-1]).read_bytes() == before

@@ -47,7 +47,9 @@ _PARTS: dict[str, Part] = {
 }  # fmt: skip
 """Options that name a file of a project, for which its folder stands."""
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
-_ENDINGS = {"picture": (".png", ".jpg", ".jpeg"), "report": (".html",)}
+_ENDINGS = {"picture": (".png", ".jpg", ".jpeg"), "report": (".html",), "recording": (".rrd",)}
+_NEVER_READ = (".html", ".json")
+"""Endings of what commands write and no command reads from a folder: there they replace the last one of its name."""
 _LARGEST_SEED = 2**32 - 1
 PORT_OPTIONS = """
 --port N            port of the page (default: any free one)
@@ -195,8 +197,10 @@ class Arguments(argparse.Namespace):
             option = {"connect": "--connect", "zenoh_config": "--zenoh-config"}.get(error.key, error.key)
             raise InputError(f"{self.command.prog}: {option}: {error.text}") from None
 
-    def check_outputs(self, *names: str) -> None:
-        """Refuse, before any work, outputs that can't be written, exist (without --force), or are given twice."""
+    def check_outputs(self, *names: str, page: str = "") -> None:
+        """Refuse, before any work, outputs that can't be written, exist (without --force), are given twice, or have an
+        ending of something else; ``page``: the one that is an HTML page.
+        """
         written: dict[Path, str] = {}
         for name in names:
             path, option = getattr(self, name), _option(name)
@@ -210,8 +214,11 @@ class Arguments(argparse.Namespace):
                 raise InputError(f"{option} {path}: is a folder; a file")
             if path.exists() and not getattr(self, "force", True):
                 raise InputError(f"{option} {path}: is there already; another file, or --force to replace it")
-            if path.suffix.lower() not in _ENDINGS.get(name, (path.suffix.lower(),)):
-                raise InputError(f"{option} {path}: has no known ending; {' or '.join(_ENDINGS[name][:2])}")
+            if path.exists() and path.suffix.lower() not in _NEVER_READ and self._in_folder(path):
+                raise InputError(f"{option} {path}: is there already, in a folder that is read; another file")
+            endings = _ENDINGS.get("report" if name == page else name, (path.suffix.lower(),))
+            if path.suffix.lower() not in endings:
+                raise InputError(f"{option} {path}: has no known ending; {' or '.join(endings[:2])}")
 
     def _reading(self, path: Path, written: Sequence[str]) -> str | None:
         """The option by which a file is an input, too; None with --force, which replaces it once it is read."""
@@ -221,6 +228,13 @@ class Arguments(argparse.Namespace):
                 if isinstance(each, Path) and each.resolve() == path.resolve() and name not in written:
                     return None if hasattr(self, "force") else option or name.upper()
         return None
+
+    def _in_folder(self, path: Path) -> bool:
+        """Whether a file lies in a folder that is an input; not with --force."""
+        given = [getattr(self, name) for name in self.command.arguments]
+        inputs = [each for value in given for each in (value if isinstance(value, list) else [value])]
+        folders = [each.resolve() for each in inputs if isinstance(each, Path) and each.is_dir()]
+        return not hasattr(self, "force") and any(folder in path.resolve().parents for folder in folders)
 
     def save(self, name: str, content: Any) -> None:
         """Write a file atomically, if its option was given: bytes, a calibration as YAML, a picture in the format of

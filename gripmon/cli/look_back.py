@@ -102,7 +102,7 @@ def report(arguments: Arguments) -> None:
     data_path, to_stdout = arguments.json, arguments.json == _TO_STDOUT
     if arguments.out is None and data_path is None:
         arguments.out = Path("report.html")
-    arguments.check_outputs("out", *(() if to_stdout else ("json",)))
+    arguments.check_outputs("out", *(() if to_stdout else ("json",)), page="out")
     from gripmon.analyse.api import report
 
     limits = {"limit_m": arguments.metres("limit_mm"), "limit_rad": arguments.radians("limit_deg")}
