@@ -92,6 +92,22 @@ def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn:
         assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
 
 
+def test_before_plain_walls_that_no_edge_crosses_a_pad_of_their_grey_is_no_background() -> None:
+    """Edges come and go nowhere, which says nothing; grey levels change less beyond the pad's edge than anywhere."""
+    rng, images = np.random.default_rng(3), []
+    for _ in range(8):
+        image = np.full((200, 300), 120.0 + rng.normal(0.0, 30.0))
+        image[60:120, 100:130] = 120.0 + rng.normal(0.0, 3.0)
+        image[60:180, 60:100] = 50.0
+        images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
+    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
+    still[60:180, 60:100] = True
+    behind = Background.of(stack, still, np.zeros_like(edges_that_stay(list(stack)).changing))
+    for row, begins in ((65.0, False), (130.0, True)):
+        along = np.column_stack([np.full(45, 99.5), row + np.arange(45.0)])
+        assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
+
+
 def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:
     """A long side is seen less far than its line goes on; halfway across the gap a vertex would tilt it."""
     a, turn_rad = np.array([101.0, 0.0]), np.radians(10.0)
