@@ -322,11 +322,11 @@ def test_another_target_than_the_lens_s_is_confirmed_for_these_two_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
+    project, twice = Project(tmp_path), "circles:12x10:0.016:0.008"
     (tmp_path / "standing").mkdir()
     for name in ("standing/000.png", "standing/rough.yaml"):
         (tmp_path / name).write_text("")
     (tmp_path / "camera.yaml").write_text(f"target: {new_user.TARGET}\n")
-    project, twice = Project(tmp_path), "circles:12x10:0.016:0.008"
     assert other_target(project.values) == ""
     project.keep({"target": twice})
     project.keep({"other_target": other_target(project.values)})
@@ -435,6 +435,16 @@ def test_what_the_ruler_says_scales_the_target(tmp_path: Path):
     assert again.states()[1].progress == "done" and target_in(again.values) == target_in(project.values)
     again.keep({"have": "I have one"})
     assert target_in(again.values) == TARGET
+
+
+def test_files_that_it_did_not_write_are_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for name, text in (("camera.yaml", "mine"), ("setup.yaml", "my: notes\n")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_text(text)
+        assert main(["setup", str(folder), "--step", "target"]) == 2
+        assert name in capsys.readouterr().err and (folder / name).read_text() == text
+        assert [path.name for path in folder.iterdir()] == [name]
 
 
 def test_a_project_that_cant_be_read_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

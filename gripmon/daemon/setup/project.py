@@ -72,8 +72,15 @@ class Project:
         path = self.folder / SETUP
         if path.exists():
             kept = read_yaml(path)
+            if not kept.keys() & {"values", "accepted"}:
+                raise InputError(f"{path}: isn't a file of gripmon setup, which would replace it; another folder")
             self.values |= _texts(path, kept, "values")
             self._accepted = _texts(path, kept, "accepted")
+            return
+        written = dict.fromkeys(name for step in STEPS for name in step.plan(self.values).writes)
+        if theirs := [name for name in written if (self.folder / name).is_file()]:
+            right = "a folder of its own, in which a step asks for a file of yours where it can use it"
+            raise InputError(f"{self.folder}: {', '.join(theirs)} would be replaced; {right}")
 
     def keep(self, values: Mapping[str, str]) -> None:
         """Store a person's answers, even if they turn out wrong.  Raises :class:`InputError`."""
