@@ -191,6 +191,12 @@ def test_the_last_valid_estimate_counts(tmp_path: Path, capsys: pytest.CaptureFi
     content = json.loads(out)
     assert code == 0 and content["cam_T_grip"] == json.loads(to_json(MEASURED.cam_T_grip))
     assert f"frame {MEASURED.seq} (line 2)" in " ".join(content["notes"])
+    # Of a daemon that was killed, or writes just now; a broken line before others is none of its.
+    path.write_bytes(to_json(MEASURED) + b"\n" + to_json(other)[:200])
+    code, out, _ = gripmon(capsys, "export", path, "--format", "json")
+    assert code == 0 and f"frame {MEASURED.seq} (line 1), line 2 is unfinished" in ", ".join(json.loads(out)["notes"])
+    path.write_bytes(to_json(MEASURED) + b"\n" + to_json(other)[:200] + b"\n")
+    assert gripmon(capsys, "export", path, "--format", "json")[0] == 2
     path.write_bytes(to_json(NOTHING))
     code, _, said = gripmon(capsys, "export", path, "--format", "json")
     assert code == 2 and "no line has a valid transform" in said

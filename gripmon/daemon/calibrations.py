@@ -179,15 +179,18 @@ def _state(path: Path, data: bytes) -> Calibrated:
 
 
 def _estimates(path: Path, data: bytes) -> Calibrated:
-    """The last line with a valid transform."""
+    """The last line with a valid transform; a daemon that was killed, or that writes just now, leaves a part of one."""
     decoder = msgspec.json.Decoder(FrameRecord)
-    lines = data.splitlines()
+    lines, left_out = data.splitlines(), list[str]()
     for number in range(len(lines), 0, -1):
         if not lines[number - 1].strip():
             continue
         try:
             record = decoder.decode(lines[number - 1])
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            if 1 < number == len(lines) and not data.endswith(b"\n"):
+                left_out.append(f"line {number} is unfinished, and left out")
+                continue
             raise InputError(f"{path}: line {number}: isn't an estimate ({error}); {_RIGHT}") from None
         if record.verdict == "valid" and record.cam_T_grip is not None and record.covariance is not None:
             return Calibrated(
@@ -196,7 +199,9 @@ def _estimates(path: Path, data: bytes) -> Calibrated:
                 cam_T_grip=record.cam_T_grip,
                 covariance=record.covariance,
                 jaw_opening_m=record.jaw_opening_m,
-                pose_notes=(f"the estimate of frame {record.seq} (line {number})", *_uncertainty(record.covariance)),
+                pose_notes=(
+                    f"the estimate of frame {record.seq} (line {number})", *left_out, *_uncertainty(record.covariance)
+                ),
             )
     raise InputError(f"{path}: no line has a valid transform; {_RIGHT}")
 
