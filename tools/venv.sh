@@ -40,7 +40,7 @@ ensure_venv() {
             "$("$python" -c 'import sys; print(f"python{sys.version_info[0]}.{sys.version_info[1]}-venv")')"
         exit 2
     fi
-    say "Installing gripmon$extras into $venv (once; a minute or two, 1.3 GB on disk) …"
+    say "Installing gripmon$extras into $venv (once; a minute or two, 1.5 GB on disk) …"
     "$venv/bin/python" -c '' 2>/dev/null || "$python" -m venv --clear "$venv"
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$checkout$extras"
     printf '%s\n' "$want" >"$stamp"

@@ -230,9 +230,10 @@ class ChildProcess:
         return answer
 
     def close(self) -> None:
-        """End it."""
+        """End it.  An interrupt at the very end of a command has nothing left to stop."""
         self._connection.close()
-        self._process.wait()
+        with contextlib.suppress(KeyboardInterrupt):
+            self._process.wait()
 
 
 class _WasIdleError(Exception):
