@@ -220,7 +220,7 @@ def test_targets_are_read_as_they_are_named(text: str):
     ("text", "reason"),
     [
         ("checkers:9x6:0.025", "'checkers' is not a target; chequerboard:COLUMNSxROWS:SQUARE"),
-        ("chequerboard:9x6", "has 1 parts after its kind"),
+        ("chequerboard:9x6", "has 1 part after its kind"),
         ("chequerboard:9x6x2:0.02", "can't be read"),
         ("chequerboard:9x6:wide", "can't be read"),
         ("chequerboard:9x6:25", "25.0 m between its points (millimetres?)"),

@@ -246,3 +246,5 @@ def test_wrong_usage_is_one_line(collision: tuple[Path, Simulator], tmp_path: Pa
     ):
         code, _, err = run(capsys, *arguments)
         assert code == 2 and word in err and len(err.splitlines()) == 1
+    (tmp_path / "estimates.jsonl").touch()
+    assert run(capsys, str(tmp_path))[2].endswith(f"{tmp_path / 'estimates.jsonl'} by its name\n")

@@ -143,7 +143,7 @@ def parse_target(text: str) -> Target:
     right = _FORMS[kind]
     lengths = {"chequerboard": (2, 2), "charuco": (3, 4)}.get(kind, (3, 3))
     if not lengths[0] <= len(parts) <= lengths[1]:
-        raise TargetError(f"'{text}' has {len(parts)} parts after its kind; {right}")
+        raise TargetError(f"'{text}' has {len(parts)} part{'s' * (len(parts) != 1)} after its kind; {right}")
     try:
         columns, rows = (int(n) for n in parts[0].lower().split("x"))
         numbers = [float(p) for p in parts[1 : 2 if kind == "chequerboard" else 3]]

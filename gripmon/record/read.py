@@ -137,7 +137,9 @@ def _files(paths: Sequence[Path], faults: list[str]) -> Iterable[Path]:
             faults.append(f"{path}: {error.strerror}; not used")
             continue
         if not found:
-            faults.append(f"{path}: holds no {_SUFFIX} file; name the folder that recordings were written to")
+            estimates = path / "estimates.jsonl"
+            right = f"{estimates} by its name" if estimates.is_file() else "the folder that recordings were written to"
+            faults.append(f"{path}: holds no {_SUFFIX} file; {right}")
         yield from found
 
 
