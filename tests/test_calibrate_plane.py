@@ -179,6 +179,10 @@ def test_a_gripper_that_isnt_known_and_a_configuration_that_needs_no_editing(
     check_truth(hand_eye(here / "he2.yaml"))
     assert plane("p1.png", "--config", "arm.yaml", "--target", TWICE, "--out", "he3.yaml") == 2
     assert f"the camera was calibrated with {TARGET}" in capsys.readouterr().err
+    # And the corners that it was inferred from do for the gripper's own file.
+    known = ["--camera", "camera.yaml", "--gripper", "new.yaml", "--jaw-opening", str(OPENING_M), "--target", TARGET]
+    assert plane("p1.png", *known, "--corners", "outline.yaml", "--out", "he4.yaml") == 0
+    check_truth(hand_eye(here / "he4.yaml"))
     # The camera's file counts there, too.
     assert np.sqrt(hand_eye(here / "he2.yaml").covariance[14]) > 0.9 * 0.115 * 0.2 / 962.0
 

@@ -280,7 +280,8 @@ def view_in(
 
 def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
     """Rough corners of a gripper (None: an unknown one).  :class:`~gripmon.model.errors.InputError`."""
-    rough = read_settings(path, RoughCorners).corners
+    given = read_settings(path, RoughCorners)
+    rough = given.corners if gripper is None else given.of(gripper)
     try:
         if gripper is None:
             outlines_of(rough)

@@ -174,6 +174,10 @@ class RoughCorners(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     corners: Annotated[dict[str, Pixel], Meta(min_length=1, description="name: [u, v] (px)")]
 
+    def of(self, gripper: Gripper) -> dict[str, Pixel]:
+        """Without the points on edges of this gripper, which a file that it was inferred from names, too."""
+        return {n: at for n, at in self.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
+
 
 JAW_SIGMA_M = 2e-4
 """Assumed standard deviation of the jaw opening in an image on a plate."""

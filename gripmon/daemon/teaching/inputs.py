@@ -139,9 +139,7 @@ def read_inputs(
 
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file (px)."""
-    rough = read_settings(path, RoughCorners)
-    # A file for calibrate plane --infer also names points on edges, which are not corners.
-    corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
+    corners = read_settings(path, RoughCorners).of(gripper)
     fault = corners_fault(corners, gripper)
     if fault is not None:
         raise InputError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}")
