@@ -108,6 +108,24 @@ def test_before_plain_walls_that_no_edge_crosses_a_pad_of_their_grey_is_no_backg
         assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
 
 
+@pytest.mark.parametrize(("table_px", "begins"), [(110, True), (30, False)])
+def test_a_calm_plain_table_larger_than_all_that_stays_is_a_background(table_px: int, begins: bool) -> None:
+    """It is lit alike in all images and no edge crosses it, while walls and things come and go beside it: as calm as a
+    pad, but no gripper has a part without an edge that is larger than all of it that shows.
+    """
+    rng, images = np.random.default_rng(4), []
+    for _ in range(8):
+        image = np.full((200, 300), 120.0 + rng.normal(0.0, 30.0))
+        image[100:180, 100 : 100 + table_px] = 140.0 + rng.normal(0.0, 3.0)
+        image[60:180, 60:100] = 50.0
+        images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
+    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
+    still[60:180, 60:100] = True
+    behind = Background.of(stack, still, np.zeros_like(edges_that_stay(list(stack)).changing))
+    along = np.column_stack([np.full(45, 99.5), 120.0 + np.arange(45.0)])
+    assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
+
+
 def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:
     """A long side is seen less far than its line goes on; halfway across the gap a vertex would tilt it."""
     a, turn_rad = np.array([101.0, 0.0]), np.radians(10.0)

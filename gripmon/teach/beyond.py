@@ -53,13 +53,14 @@ class Background:
     def begins(self, stations: Stations) -> bool:
         """Whether grey levels at 4.5 to 8 px beyond these stations change as a background's, or edges come and go: what
         does neither more than almost anywhere in the background is a tip or a pad of whatever grey, or the finger
-        itself, of which only a face was found: it isn't compared with what joins it.  Where most of the background is
-        as plain, nothing shows it.
+        itself, of which only a face was found: it isn't compared with what joins it.  What of a gripper shows no
+        edge is no larger than what stays: a plain table that is lit alike in all images is no part of it.
         """
         s = np.arange(4.5, WIDE_PX + 0.25, STEP_PX)
         found = across(np.stack([self.scatter, self.changing]), stations, s).mean(axis=(1, 2))
-        others = self.far & ~self._joined(stations, s, *found.tolist())
-        if np.count_nonzero(others) < 0.5 * np.count_nonzero(self.far):
+        joined = self._joined(stations, s, *found.tolist())
+        others = self.far & ~joined
+        if np.count_nonzero(joined) > np.count_nonzero(~self.outside) or not others.any():
             return True
         # Strictly: before plain walls edges come and go hardly anywhere, and as little of that says nothing.
         calmer = (self.places[:, others] < found[:, None]).mean(axis=1)
