@@ -125,3 +125,15 @@ def test_two_who_drew_the_same_finger_agree():
     assert lines is not None
     off = beside(lines, projected_outline(config.gripper, config.camera, from_record(config.reference.cam_T_grip)))
     assert off.written[1] < 1.2 and off.drawn[1] < 1.2 and off.covered > 0.95
+
+
+@pytest.mark.parametrize("name", ["xarm", "piper"])
+@pytest.mark.skipif(not (REAL / "piper").is_dir(), reason="../shared/data/real is not there")
+def test_a_real_gripper_is_made_from_its_images_as_it_was_drawn_by_hand(name: str, tmp_path: Path):
+    from benchmarks.real import LIMITS, PLAY_M
+    from benchmarks.real_images import LEAST_COVERED, WITHIN_PX, made_from_images, tasks
+
+    made = made_from_images(name, REAL / name, tmp_path, tasks(LIMITS, PLAY_M)[name])
+    assert made.code == 0, made.words
+    assert made.off is not None
+    assert made.off.written[1] < WITHIN_PX and made.off.covered > LEAST_COVERED
