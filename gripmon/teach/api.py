@@ -139,7 +139,9 @@ def teach(
             raise InputError(f"{each.path}: {wrong}; {right}")
     _check_different(pictures)
     seen = told_response(pictures, response, settings.corners.edges.response if config.says_response else None)
-    rig = Rig(config.camera, gripper, settings.with_response(seen.response))
+    if not config.says_response:
+        settings = settings.with_response(seen.response, seen.sigma_px)
+    rig = Rig(config.camera, gripper, settings)
     try:
         return taught_from(pictures, rig, config.reference, seen, command)
     except TeachingRefused as refused:

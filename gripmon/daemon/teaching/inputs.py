@@ -108,8 +108,8 @@ def read_inputs(
     later = live is not None and said is None and response == "auto"
     light = None if later else told_response(pictures, response, said)
     setup = replace(setup, distance_m=distance_m)
-    if light is not None:
-        setup = replace(setup, settings=setup.settings.with_response(light.response))
+    if light is not None and said is None:
+        setup = replace(setup, settings=setup.settings.with_response(light.response, light.sigma_px))
     frames: SourceSettings
     try:
         if live is not None:
