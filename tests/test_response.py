@@ -26,6 +26,7 @@ from gripmon.model.response import (
 )
 from gripmon.simulate.disturbance import srgb_dn
 from gripmon.simulate.scenario import Sensor
+from gripmon.teach.api import Picture, told_response
 from gripmon.teach.from_images import gripper_from_images
 from gripmon.teach.outline_edges import edge_between
 from gripmon.track.edges import MeasurementSettings
@@ -125,6 +126,13 @@ def test_an_unknown_response_is_in_the_standard_deviation_of_every_edge():
         for taught, sigma_px in ((False, more_px), (True, TAUGHT_SHARE * more_px)):
             floor_px = unknown.with_response(taught).consensus.edge_floor_px
             assert floor_px == pytest.approx(np.hypot(0.02, sigma_px))
+
+
+def test_what_a_configuration_says_of_an_unknown_response_is_what_teaching_tells():
+    images = images_of(moving_robot(301, "blobs"), 3)
+    pictures = [Picture(f"{k}", image, None, None) for k, image in enumerate(images)]
+    seen = told_response(pictures, "auto", EdgeSettings(response="unknown", response_sigma_px=0.13))
+    assert seen.response == "unknown" and seen.sigma_px == 0.13 and "up to 0.13 px more" in seen.text()
 
 
 @pytest.mark.parametrize(("dark", "bright"), [(0.1, 0.9), (0.1, 0.5), (0.1, 0.2), (0.3, 0.6)])
