@@ -205,7 +205,7 @@ def test_a_target_comes_from_a_calibration_too(tmp_path: Path, capsys: pytest.Ca
         ("target: 3\n", "names no target"),
         ("kind: discs\n", "Invalid value 'discs'"),
         ("target: {kind: circles, columns: 8}\n", "missing required field `rows`"),
-        ("target: circles:8\n", "'circles:8' has 1 part"),
+        ("target: circles:8\n", "'circles:8' has 1 part after its kind; circles:COLUMNSxROWS"),
         ('provenance: {command: "--target \'"}\n', "names no target"),
         ("[", "he.yaml"),
     ):

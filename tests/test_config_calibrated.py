@@ -106,19 +106,16 @@ def test_a_projects_folder_is_its_configuration(folder: Path):
 
 
 def test_the_response_that_a_references_images_show_holds_where_nothing_else_is_said(folder: Path):
-    def response() -> tuple[str, float, bool]:
+    def response() -> tuple[str, bool]:
         config = load_config(folder / "arm.yaml")
-        edges = config.settings.monitor.corners.edges
-        return edges.response, edges.response_sigma_px, config.knows_response
+        return config.settings.monitor.corners.edges.response, config.knows_response
 
-    assert response() == ("linear", 0.2, False)
+    assert response() == ("linear", False)
     change(folder / "hand_eye.yaml", lambda v: v.update(response="unknown"))
-    assert response() == ("unknown", 0.2, True)
-    change(folder / "hand_eye.yaml", lambda v: v.update(response_sigma_px=0.13))
-    assert response() == ("unknown", 0.13, True)
+    assert response() == ("unknown", True)
     said = {"corners": {"edges": {"response": "srgb"}}}
     change(folder / "arm.yaml", lambda v: v.setdefault("monitor", {}).update(said))
-    assert response() == ("srgb", 0.2, True)
+    assert response() == ("srgb", True)
 
 
 def test_a_reference_of_the_gripper_files_own_images_stays_one(folder: Path):

@@ -9,15 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from scipy import special
 from support.changing_backgrounds import crossing_px, images_of, moving_robot
 
 from gripmon.model.camera import BrownConradyLens, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.response import (
-    BETWEEN_GAMMAS,
-    SRGB_GAMMA,
-    TAUGHT_SHARE,
+    TAUGHT_SIGMA_PX,
     UNKNOWN_SIGMA_PX,
     find_response,
     in_light,
@@ -26,9 +23,7 @@ from gripmon.model.response import (
 )
 from gripmon.simulate.disturbance import srgb_dn
 from gripmon.simulate.scenario import Sensor
-from gripmon.teach.api import Picture, told_response
 from gripmon.teach.from_images import gripper_from_images
-from gripmon.teach.outline_edges import edge_between
 from gripmon.track.edges import MeasurementSettings
 from gripmon.track.edges.settings import EdgeSettings
 
@@ -120,49 +115,7 @@ def test_play_of_the_mount_is_not_taken_for_a_response():
 def test_an_unknown_response_is_in_the_standard_deviation_of_every_edge():
     settings = MeasurementSettings()
     assert settings.with_response(False) is settings
-    for more_px in (UNKNOWN_SIGMA_PX, 0.07):
-        edges = EdgeSettings(response="unknown", response_sigma_px=more_px)
-        unknown = msgspec.structs.replace(settings, edges=edges)
-        for taught, sigma_px in ((False, more_px), (True, TAUGHT_SHARE * more_px)):
-            floor_px = unknown.with_response(taught).consensus.edge_floor_px
-            assert floor_px == pytest.approx(np.hypot(0.02, sigma_px))
-
-
-def test_what_a_configuration_says_of_an_unknown_response_is_what_teaching_tells():
-    images = images_of(moving_robot(301, "blobs"), 3)
-    pictures = [Picture(f"{k}", image, None, None) for k, image in enumerate(images)]
-    seen = told_response(pictures, "auto", EdgeSettings(response="unknown", response_sigma_px=0.13))
-    assert seen.response == "unknown" and seen.sigma_px == 0.13 and "up to 0.13 px more" in seen.text()
-
-
-@pytest.mark.parametrize(("dark", "bright"), [(0.1, 0.9), (0.1, 0.5), (0.1, 0.2), (0.3, 0.6)])
-def test_what_is_read_as_linear_is_off_in_proportion_to_its_power(dark: float, bright: float):
-    """A border whose grey levels are these powers of the light, blurred by 0.8 px, as the measurement sees it."""
-
-    lens = BrownConradyLens(width_px=61, height_px=61, fx_px=100.0, fy_px=100.0, cx_px=30.0, cy_px=30.0)
-    camera = make_camera(lens)
-
-    def off_px(gamma: float) -> float:
-        share = special.ndtr((np.arange(61.0) - 30.0) / 0.8)
-        grey = ((1.0 - share) * dark**gamma + share * bright**gamma) ** (1.0 / gamma)
-        image = np.tile(np.float32(grey), (61, 1))
-        seen = edge_between(camera, image, np.array([[30.0, 10.0], [30.0, 50.0]]), 4.0, 2.0)
-        assert seen is not None
-        return float(seen.at_px(seen.line.ends_px)[:, 0].mean() - 30.0)
-
-    whole_px = off_px(SRGB_GAMMA)
-    assert abs(off_px(1.0)) < 0.01 and abs(whole_px) > 0.1
-    for gamma in (0.7, 1.3, 1.7):
-        assert off_px(gamma) == pytest.approx(whole_px * (gamma - 1.0) / (SRGB_GAMMA - 1.0), rel=0.25)
-
-
-def test_images_that_narrow_the_response_down_leave_less_of_its_error():
-    """Halfway between linear and sRGB: neither for sure, but not everything between them, either."""
-    linear = [image / 255.0 for image in images_of(moving_robot(305, "chequer"), 12)]
-    grey = [np.rint(255.0 * image ** (1.0 / BETWEEN_GAMMAS)).astype(np.uint8) for image in linear]
-    seen = find_response([np.dstack([image // 2, image, image]) for image in grey])
-    assert seen.response == "unknown" and seen.low < BETWEEN_GAMMAS < seen.high
-    # As far from linear as 1.5 is, of powers that are anywhere from 1 to 2.2 with the same probability.
-    off = (BETWEEN_GAMMAS - 1.0) / np.sqrt(np.square(np.linspace(0.0, SRGB_GAMMA - 1.0, 1201)).mean())
-    assert off < seen.sigma_px / UNKNOWN_SIGMA_PX < 1.3 * off
-    assert f"up to {seen.sigma_px:.2g} px more" in seen.text()
+    unknown = msgspec.structs.replace(settings, edges=EdgeSettings(response="unknown"))
+    for taught, sigma_px in ((False, UNKNOWN_SIGMA_PX), (True, TAUGHT_SIGMA_PX)):
+        floor_px = unknown.with_response(taught).consensus.edge_floor_px
+        assert floor_px == pytest.approx(np.hypot(0.02, sigma_px))

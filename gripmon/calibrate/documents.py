@@ -77,7 +77,7 @@ class HandEyeCalibration(
     """``cam_T_grip`` with the covariance of its error (position of the TCP, then rotation, camera axes; m, rad).
 
     ``with_gripper``: the gripper file was made of the same images, whose errors of size and tilt this has as well, and
-    which show the camera's ``response``, and what it adds to every edge's standard deviation if it is unknown.
+    which show the camera's ``response``.
     """
 
     camera: LensSettings
@@ -88,7 +88,6 @@ class HandEyeCalibration(
     residuals: HandEyeResiduals
     with_gripper: bool = False
     response: Response | None = None
-    response_sigma_px: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -26,16 +26,12 @@ from gripmon.model.errors import InputError
 from gripmon.model.records import Array, Image
 
 Response = Literal["linear", "srgb", "unknown"]
-"""How grey levels follow the light; unknown: read as linear, and :attr:`ResponseSeen.sigma_px` in every bound."""
+"""How grey levels follow the light; unknown: read as linear, and :data:`UNKNOWN_SIGMA_PX` in every bound."""
 
-UNKNOWN_SIGMA_PX, TAUGHT_SHARE = 0.2, 0.5
-"""Standard deviation of an edge whose response isn't known at all (px), and the part of it that a taught edge has: sRGB
-taken as linear moves edges of dark fingers by 0.04 to 0.33 px, and all powers between are as likely; teaching takes off
-what the backgrounds have in common, the rest is evenly spread.
+UNKNOWN_SIGMA_PX, TAUGHT_SIGMA_PX = 0.2, 0.1
+"""Standard deviation of an edge whose response isn't known (px), and of a taught one: sRGB taken as linear moves edges
+of dark fingers by 0.04 to 0.33 px; teaching takes off what the backgrounds have in common, the rest is evenly spread.
 """
-
-SRGB_GAMMA = 2.2
-"""Power of the light of sRGB's grey levels (IEC 61966-2-1)."""
 
 BETWEEN_GAMMAS = 1.5
 """Power between those of linear (1) and sRGB (2.2) grey levels, their geometric mean (no unit)."""
@@ -63,8 +59,7 @@ class ResponseSeen:
     """How grey levels follow the light, and how that is known.
 
     ``response`` as the images show it; the ``gamma`` that explains them best, within ``low`` and ``high`` (90 %), NaN
-    where nothing can be said; ``why``, a text.  ``off``: by how far that power may be from linear's, root mean square,
-    over the same of all powers between linear and sRGB alike.
+    where nothing can be said; ``why``, a text.
     """
 
     response: Response
@@ -72,14 +67,11 @@ class ResponseSeen:
     gamma: float = math.nan
     low: float = math.nan
     high: float = math.nan
-    off: float = 1.0
 
     @property
     def sigma_px(self) -> float:
-        """What not knowing it adds to an edge's standard deviation (px): an edge that is read as linear is off in
-        proportion to how far the power is from 1.
-        """
-        return round(UNKNOWN_SIGMA_PX * self.off, 3) if self.response == "unknown" else 0.0
+        """What not knowing it adds to an edge's standard deviation (px)."""
+        return UNKNOWN_SIGMA_PX if self.response == "unknown" else 0.0
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -88,7 +80,7 @@ class ResponseSeen:
 
     def text(self) -> str:
         """One line for a person."""
-        effect = f": read as linear, up to {self.sigma_px:.2g} px more in every edge's standard deviation"
+        effect = f": read as linear, up to {UNKNOWN_SIGMA_PX:g} px more in every edge's standard deviation"
         return f"response: {self.response}{effect if self.response == 'unknown' else ''} ({self.why})"
 
 
@@ -156,17 +148,14 @@ def find_response(images: Sequence[Image], openings_m: Sequence[float | None] | 
     if not found:
         return _untold(images, "the images show too few borders that stay before backgrounds that change")
     gamma = _best(np.sum([costs.sum(axis=(1, 2)) for costs in found], axis=0))
-    drawn = _drawn(found)
-    low, high = np.quantile(drawn, [0.5 * _RISK, 1.0 - 0.5 * _RISK]).tolist()
+    low, high = np.quantile(_drawn(found), [0.5 * _RISK, 1.0 - 0.5 * _RISK]).tolist()
     seen = f"borders before different backgrounds show gamma {gamma:.1f}, {low:.1f} to {high:.1f} (90 %)"
     sound = _GAMMAS[1] <= gamma <= _GAMMAS[-2]
     if sound and high < BETWEEN_GAMMAS:
         return ResponseSeen("linear", seen, gamma, low, high)
     if sound and low > BETWEEN_GAMMAS:
         return ResponseSeen("srgb", seen, gamma, low, high)
-    off = float(np.sqrt(3.0 * np.square((drawn - 1.0) / (SRGB_GAMMA - 1.0)).mean())) if sound else 1.0
-    off = min(off, 1.0)  # images that tell less than that it is somewhere between the two tell nothing
-    return _untold(images, f"{seen}: neither linear nor sRGB for sure", gamma, low, high, off)
+    return _untold(images, f"{seen}: neither linear nor sRGB for sure", gamma, low, high)
 
 
 def _alike(openings_m: Sequence[float | None] | None, count: int) -> list[list[int]]:
@@ -179,12 +168,11 @@ def _alike(openings_m: Sequence[float | None] | None, count: int) -> list[list[i
 
 
 def _untold(
-    images: Sequence[Image], why: str, gamma: float = np.nan, low: float = np.nan, high: float = np.nan,
-    off: float = 1.0,
-) -> ResponseSeen:  # fmt: skip
+    images: Sequence[Image], why: str, gamma: float = np.nan, low: float = np.nan, high: float = np.nan
+) -> ResponseSeen:
     if likely_linear(images) and not low > 1.0:
         return ResponseSeen("linear", f"{why}; linear is assumed of images without colour", gamma, low, high)
-    return ResponseSeen("unknown", why, gamma, low, high, off)
+    return ResponseSeen("unknown", why, gamma, low, high)
 
 
 def _levels(image: Image) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.judge.smoothing import SmoothingSettings
 from gripmon.judge.stream import StreamSettings
-from gripmon.model.response import UNKNOWN_SIGMA_PX, Response
+from gripmon.model.response import Response
 from gripmon.track.edges import MeasurementSettings
 
 
@@ -85,8 +85,7 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     stream: StreamSettings = StreamSettings()
     recalibration: RecalibrationSettings = RecalibrationSettings()
 
-    def with_response(self, response: Response, sigma_px: float = UNKNOWN_SIGMA_PX) -> MonitorSettings:
-        """The same with another ``corners.edges.response``, which adds ``sigma_px`` if it is unknown."""
-        more_px = sigma_px if response == "unknown" else UNKNOWN_SIGMA_PX
-        edges = msgspec.structs.replace(self.corners.edges, response=response, response_sigma_px=more_px)
+    def with_response(self, response: Response) -> MonitorSettings:
+        """The same with another ``corners.edges.response``."""
+        edges = msgspec.structs.replace(self.corners.edges, response=response)
         return msgspec.structs.replace(self, corners=msgspec.structs.replace(self.corners, edges=edges))

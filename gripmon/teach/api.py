@@ -23,7 +23,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.images import image_in, image_paths
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
-from gripmon.model.response import UNKNOWN_SIGMA_PX, ResponseSeen, response_of
+from gripmon.model.response import Response, ResponseSeen, response_of
 from gripmon.model.yaml_text import as_yaml
 from gripmon.monitor import MonitorSettings, Tracker, seen_in_images, warm_up
 from gripmon.teach.drawing import draw_taught
@@ -33,7 +33,6 @@ from gripmon.teach.measure import teach as teach_images
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
-from gripmon.track.edges.settings import EdgeSettings
 from gripmon.track.edges.taught import Provenance, TaughtImage, TaughtModel, identity, own_covariance
 
 __all__ = ["Configured", "Teaching", "teach"]
@@ -139,10 +138,8 @@ def teach(
             right = f"--jaw-opening M, or jaw_opening_m in {Path(each.path).parent / TIMESTAMPS_NAME}"
             raise InputError(f"{each.path}: {wrong}; {right}")
     _check_different(pictures)
-    seen = told_response(pictures, response, settings.corners.edges if config.says_response else None)
-    if not config.says_response:
-        settings = settings.with_response(seen.response, seen.sigma_px)
-    rig = Rig(config.camera, gripper, settings)
+    seen = told_response(pictures, response, settings.corners.edges.response if config.says_response else None)
+    rig = Rig(config.camera, gripper, settings.with_response(seen.response))
     try:
         return taught_from(pictures, rig, config.reference, seen, command)
     except TeachingRefused as refused:
@@ -187,21 +184,18 @@ def _with_what_is_seen(
     return msgspec.structs.replace(model, reference=known)
 
 
-def told_response(pictures: Sequence[Picture], asked: str, said: EdgeSettings | None) -> ResponseSeen:
-    """The response that is ``asked`` for; for auto the one that a configuration has ``said`` (None: it hasn't), else
-    what the pictures show.  Raises :class:`~gripmon.model.errors.InputError` where what is asked contradicts what is
-    configured.
+def told_response(pictures: Sequence[Picture], asked: str, configured: Response | None) -> ResponseSeen:
+    """The response that is ``asked`` for; for auto the one that is ``configured`` (None: not said), else what the
+    pictures show.  Raises :class:`~gripmon.model.errors.InputError` where what is asked contradicts what is configured.
     """
-    if said is not None:
-        configured = said.response
+    if configured is not None:
         if asked not in ("auto", configured):
             wrong = f"{asked}, and the configuration has monitor.corners.edges.response: {configured}"
             raise InputError(f"{wrong}; the same, or leave one of them out", "response")
         found = response_of([p.image for p in pictures], "auto", [p.jaw_opening_m for p in pictures])
         against = found.gamma > 0.0 and "unknown" not in (found.response, configured) and found.response != configured
         why = f"as configured, but {found.why}" if against else "as configured"
-        shown = found if against else ResponseSeen(configured, why)
-        return replace(shown, response=configured, why=why, off=said.response_sigma_px / UNKNOWN_SIGMA_PX)
+        return replace(found, response=configured, why=why) if against else ResponseSeen(configured, why)
     return response_of([p.image for p in pictures], asked, [p.jaw_opening_m for p in pictures])
 
 

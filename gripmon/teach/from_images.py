@@ -172,7 +172,7 @@ def gripper_from_images(
         opening_m=opening_m, corners=len(gripper.corner_ids), images=used, rms_px=rms_px,
         rms_m=rms_px * float(cam_T_grip[2, 3]) / camera.fx_px, outline_sigma_px=outline_px,
         left_out=left_out, seen=seen, shown=shown, used=placed.kept, with_gripper=reference is None,
-        response=light.response, response_sigma_px=light.sigma_px if light.response == "unknown" else None,
+        response=light.response,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ class GripperResult:
     (6, 6) of its error (position of the TCP, then rotation, camera axes; None: it is only a view), at the opening
     ``opening_m`` of a moving jaw, from so many ``corners`` in so many ``images``, which fit to ``rms_px``, ``rms_m``;
     ``with_gripper``: the gripper is made of the same images, whose errors of size and tilt both have, and which show
-    the camera's ``response``, and what it adds to every edge's standard deviation if it is unknown.
+    the camera's ``response``.
     """
 
     gripper: Gripper
@@ -44,7 +44,6 @@ class GripperResult:
     rms_m: float = 0.0
     with_gripper: bool = False
     response: Response | None = None
-    response_sigma_px: float | None = None
 
     @property
     def model(self) -> GripperModel:
@@ -68,7 +67,6 @@ class GripperResult:
             residuals=HandEyeResiduals(rms_m=self.rms_m, rms_px=self.rms_px, corners=self.corners, images=self.images),
             with_gripper=self.with_gripper,
             response=self.response,
-            response_sigma_px=self.response_sigma_px,
             warnings=self.notes,
             provenance=provenance,
         )

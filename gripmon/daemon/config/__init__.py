@@ -166,7 +166,7 @@ def load_config(
     reference = _reference(path, settings, gripper, calibrated)
     said = "response" in _within(values, "monitor", "corners", "edges")
     if not said and calibrated.response is not None:
-        monitor = settings.monitor.with_response(calibrated.response, calibrated.response_sigma_px)
+        monitor = settings.monitor.with_response(calibrated.response)
         settings = msgspec.structs.replace(settings, monitor=monitor)
     config = Config(path, settings, camera, gripper, gripper_path, reference, None, calibrated, said)
     fault = (
@@ -247,8 +247,7 @@ def _with_taught(config: Config, model: TaughtModel | None = None) -> Config:
         path = named_file(config.path, "taught", settings.taught, "a file of gripmon teach")
         model = read_settings(path, TaughtModel)
     if not config.says_response:
-        seen = model.edge_settings
-        monitor = settings.monitor.with_response(seen.response, seen.response_sigma_px)
+        monitor = settings.monitor.with_response(model.edge_settings.response)
         settings = msgspec.structs.replace(settings, monitor=monitor)
     edges = settings.monitor.corners.edges
     fault = mismatch(model, config.camera, config.gripper, config.cam_T_grip, edges)

@@ -20,7 +20,7 @@ from gripmon.model.camera import LensSettings, same_lens
 from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.provenance import provenance_of
-from gripmon.model.response import UNKNOWN_SIGMA_PX, Response
+from gripmon.model.response import Response
 from gripmon.track.edges.taught import gripper_digest
 
 _INTRINSICS = "a file of gripmon calibrate intrinsics or another program's camera"
@@ -39,12 +39,6 @@ class CalibrationFiles:
     def response(self) -> Response | None:
         """How grey levels follow the light, where the reference's images show it."""
         return None if self.hand_eye is None else self.hand_eye.response
-
-    @property
-    def response_sigma_px(self) -> float:
-        """What it adds to every edge's standard deviation (px) if it is unknown."""
-        said = None if self.hand_eye is None else self.hand_eye.response_sigma_px
-        return UNKNOWN_SIGMA_PX if said is None else said
 
 
 def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], CalibrationFiles]:

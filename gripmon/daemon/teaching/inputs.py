@@ -103,13 +103,13 @@ def read_inputs(
         raise InputError("the gripper has no jaw; leave it out", "jaw_source")
     depth = setup.settings.bit_depth
     pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, jaw_opening_m) for path in images)
-    said = None if given is None or not given.says_response else given.settings.monitor.corners.edges
+    said = None if given is None or not given.says_response else given.settings.monitor.corners.edges.response
     # A live camera's images come later: FileSaving looks at those that are kept.
     later = live is not None and said is None and response == "auto"
     light = None if later else told_response(pictures, response, said)
     setup = replace(setup, distance_m=distance_m)
-    if light is not None and said is None:
-        setup = replace(setup, settings=setup.settings.with_response(light.response, light.sigma_px))
+    if light is not None:
+        setup = replace(setup, settings=setup.settings.with_response(light.response))
     frames: SourceSettings
     try:
         if live is not None:

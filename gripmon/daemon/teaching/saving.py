@@ -104,7 +104,7 @@ class FileSaving:
         if inputs.response is not None:
             return inputs.response
         light = told_response(pictures, "auto", None)
-        settings = inputs.setup.settings.with_response(light.response, light.sigma_px)
+        settings = inputs.setup.settings.with_response(light.response)
         self._inputs = replace(inputs, setup=replace(inputs.setup, settings=settings))
         return light
 

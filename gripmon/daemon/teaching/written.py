@@ -44,8 +44,6 @@ def config_text(inputs: Inputs, order: SaveOrder, found: Evaluation, taught: str
     model, monitor = setup.gripper.model, setup.settings
     tilt_rad = NormalDist().inv_cdf(1.0 - monitor.policy.integrity_risk / 4.0) * model.tilt_sigma_rad  # of a bound
     taken: list[tuple[str, ...]] = [("corners", "edges", "response")]
-    if monitor.corners.edges.response == "unknown":
-        taken.append(("corners", "edges", "response_sigma_px"))
     if not (model.scale_sigma < SIZE_UNKNOWN and tilt_rad < monitor.policy.alert_limit_rad):
         policy = msgspec.structs.replace(monitor.policy, valid_by=ValidBy.REFERENCE)
         monitor, taken = msgspec.structs.replace(monitor, policy=policy), [*taken, ("policy", "valid_by")]

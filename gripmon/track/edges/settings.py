@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.response import TAUGHT_SHARE, UNKNOWN_SIGMA_PX, Response
+from gripmon.model.response import TAUGHT_SIGMA_PX, UNKNOWN_SIGMA_PX, Response
 
 
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -49,15 +49,6 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
             "dark; unknown: larger bounds; if left out, as gripmon teach found it"
         ),
     ] = "linear"
-    response_sigma_px: Annotated[
-        float,
-        Meta(
-            ge=0.0,
-            le=1.0,
-            description="what a response that isn't known adds to every edge's standard deviation (px); half of it "
-            "where edges are taught; less where images narrow the response down: gripmon says how far",
-        ),
-    ] = UNKNOWN_SIGMA_PX
     contrast_fraction: Annotated[
         float, Meta(ge=0.0, le=0.5, description="smallest step in grey levels as a fraction of the image's full scale")
     ] = 0.008
@@ -201,6 +192,5 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         """
         if self.edges.response != "unknown":
             return self
-        more_px = (TAUGHT_SHARE if taught else 1.0) * self.edges.response_sigma_px
-        floor_px = math.hypot(self.consensus.edge_floor_px, more_px)
+        floor_px = math.hypot(self.consensus.edge_floor_px, TAUGHT_SIGMA_PX if taught else UNKNOWN_SIGMA_PX)
         return msgspec.structs.replace(self, consensus=msgspec.structs.replace(self.consensus, edge_floor_px=floor_px))
