@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
@@ -70,6 +72,16 @@ def test_a_narrow_face_beyond_an_edge_is_told_from_six_backgrounds(face_dn: floa
         assert np.mean([found(rng, 0, spread_dn=0.0) for _ in range(40)]) <= 0.1
 
 
+def begins_right_of_the_finger(images: Sequence[np.ndarray], row: float, *, edges_come_and_go: bool) -> bool:
+    """Whether a background begins beside 45 px from this row on of a finger whose right border is at column 99.5."""
+    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
+    still[60:180, 60:100] = True
+    changing = edges_that_stay(list(stack)).changing
+    behind = Background.of(stack, still, changing if edges_come_and_go else np.zeros_like(changing))
+    along = np.column_stack([np.full(45, 99.5), row + np.arange(45.0)])
+    return behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool)))
+
+
 @pytest.mark.parametrize("pad_px", [30, 80])
 @pytest.mark.parametrize("texture_dn", [0.0, 10.0])
 def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn: float, pad_px: int) -> None:
@@ -84,12 +96,8 @@ def test_what_changes_less_than_all_of_a_textured_background_is_none(texture_dn:
         image[pad] = 120.0 + rng.normal(0.0, 3.0)
         image[60:180, 60:100] = 50.0
         images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
-    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
-    still[60:180, 60:100] = True
-    behind = Background.of(stack, still, edges_that_stay(list(stack)).changing)
     for row, begins in ((65.0, texture_dn == 0.0), (130.0, True)):
-        along = np.column_stack([np.full(45, 99.5), row + np.arange(45.0)])
-        assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
+        assert begins_right_of_the_finger(images, row, edges_come_and_go=True) == begins
 
 
 def test_before_plain_walls_that_no_edge_crosses_a_pad_of_their_grey_is_no_background() -> None:
@@ -100,12 +108,8 @@ def test_before_plain_walls_that_no_edge_crosses_a_pad_of_their_grey_is_no_backg
         image[60:120, 100:130] = 120.0 + rng.normal(0.0, 3.0)
         image[60:180, 60:100] = 50.0
         images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
-    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
-    still[60:180, 60:100] = True
-    behind = Background.of(stack, still, np.zeros_like(edges_that_stay(list(stack)).changing))
     for row, begins in ((65.0, False), (130.0, True)):
-        along = np.column_stack([np.full(45, 99.5), row + np.arange(45.0)])
-        assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
+        assert begins_right_of_the_finger(images, row, edges_come_and_go=False) == begins
 
 
 @pytest.mark.parametrize(("table_px", "begins"), [(110, True), (30, False)])
@@ -119,11 +123,7 @@ def test_a_calm_plain_table_larger_than_all_that_stays_is_a_background(table_px:
         image[100:180, 100 : 100 + table_px] = 140.0 + rng.normal(0.0, 3.0)
         image[60:180, 60:100] = 50.0
         images.append(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(size=image.shape))
-    stack, still = np.array(images, np.float32), np.zeros((200, 300), bool)
-    still[60:180, 60:100] = True
-    behind = Background.of(stack, still, np.zeros_like(edges_that_stay(list(stack)).changing))
-    along = np.column_stack([np.full(45, 99.5), 120.0 + np.arange(45.0)])
-    assert behind.begins(Stations(along, np.tile([1.0, 0.0], (45, 1)), np.ones(45, bool))) == begins
+    assert begins_right_of_the_finger(images, 120.0, edges_come_and_go=False) == begins
 
 
 def test_pieces_of_a_curve_meet_on_both_lines_wherever_between_them_that_is() -> None:
