@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from support.taught_by_hand import Rig, make_rig
 
@@ -229,6 +229,7 @@ def test_a_request_must_be_json_and_short(served: PageServer):
     ),
     by_hand=st.booleans(),
 )
+@example(corners={"L_in_near": (685.0, 0.0), "L_out_near": (-740.0, 1.0)}, by_hand=False)  # determines no pose
 def test_wherever_corners_are_put_there_is_an_answer(
     served: PageServer, corners: dict[str, tuple[float, float]], by_hand: bool
 ):

@@ -302,7 +302,8 @@ def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator
 
 def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
     """The pose (4, 4) near a start with the least weighted image error and distance from the prior, its covariance
-    (6, 6), and that cost; None where it starts behind the camera.
+    (6, 6), and that cost; None where it starts behind the camera, or ends where nothing determines it: so far away that
+    corners and prior together are singular.
     """
     information = np.linalg.inv(prior.covariance)
 
@@ -321,7 +322,11 @@ def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prio
     if not math.isfinite(cost(start)):
         return None
     found = minimise(start, cost, equations, perturb, iterations=_ROUNDS, tolerance=1e-6, damping=1e-3)
-    return found.state, np.linalg.inv(equations(found.state)[0]), found.cost
+    try:
+        covariance = np.linalg.inv(equations(found.state)[0])
+    except np.linalg.LinAlgError:
+        return None
+    return found.state, covariance, found.cost
 
 
 def _same(one: Array, other: Array) -> bool:
